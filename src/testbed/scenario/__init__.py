@@ -1,0 +1,53 @@
+"""The scenario: its models, its file, its errors.
+
+A scenario is read once, by `load_scenario` or `parse_scenario`; what comes out is complete, checked and immutable.
+"""
+
+from testbed.scenario.durations import format_duration, parse_duration
+from testbed.scenario.estimators import EstimatorSpec
+from testbed.scenario.inputs import (
+    ConstantInput,
+    ExponentialInput,
+    FeedbackInput,
+    Input,
+    SineInput,
+    TableInput,
+    UniformInput,
+)
+from testbed.scenario.links import AckLink, BernoulliLoss, Link, Links, Loss, MarkovLoss, NoLoss
+from testbed.scenario.load import load_scenario, parse_scenario
+from testbed.scenario.models import Scenario
+from testbed.scenario.schema import scenario_json_schema
+from testbed.scenario.system import System
+from testbed.scenario.transport import Clock, Tls, Transport
+from testbed.scenario.write import to_dict, to_toml
+
+__all__ = [
+    "AckLink",
+    "BernoulliLoss",
+    "Clock",
+    "ConstantInput",
+    "EstimatorSpec",
+    "ExponentialInput",
+    "FeedbackInput",
+    "Input",
+    "Link",
+    "Links",
+    "Loss",
+    "MarkovLoss",
+    "NoLoss",
+    "Scenario",
+    "SineInput",
+    "System",
+    "TableInput",
+    "Tls",
+    "Transport",
+    "UniformInput",
+    "format_duration",
+    "load_scenario",
+    "parse_duration",
+    "parse_scenario",
+    "scenario_json_schema",
+    "to_dict",
+    "to_toml",
+]

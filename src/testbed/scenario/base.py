@@ -1,0 +1,134 @@
+"""What every part of a scenario is built from: the base model, numbers, vectors and matrices.
+
+Each validator raises `problem`, whose text has the form "got …; allowed: …"; `explain` adds where.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, WithJsonSchema
+from pydantic_core import PydanticCustomError
+
+SHOWN_MAX = 60
+
+
+class Part(BaseModel):
+    """Base of the models: immutable, no unknown keys, no silent conversion between types, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    other_keys: ClassVar[tuple[str, ...]] = ()
+    """Keys allowed in the file that are resolved into fields, such as `mean_burst`."""
+    later_keys: ClassVar[tuple[str, ...]] = ()
+    """Keys that belong to later versions."""
+
+    @classmethod
+    def known_keys(cls) -> list[str]:
+        """The keys allowed in the table of this part."""
+        return [*cls.model_fields, *cls.other_keys]
+
+
+def problem(text: str, at: str = "") -> PydanticCustomError:
+    """An error of validation. `at` says where below the value under validation: a key, or an index such as "[0]"."""
+    return PydanticCustomError("problem", "{text}", {"text": text, "at": at})
+
+
+def shown(value: object) -> str:
+    """A value as it is shown in an error: one line, of limited length."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, dict):
+        return "a table"
+    text = repr(value)
+    return text if len(text) <= SHOWN_MAX else text[: SHOWN_MAX - 2] + " …"
+
+
+def number(value: object, at: str = "", allowed: str = "a finite number") -> float:
+    """`value` as a float; a problem if it is not a finite number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise problem(f"got {shown(value)}; allowed: {allowed}", at)
+    try:
+        result = float(value)
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise problem(f"got {shown(value)}; allowed: {allowed}", at)
+    return result
+
+
+def probability(value: object, at: str = "") -> float:
+    """`value` as a probability; a problem if it is not in 0 … 1."""
+    result = number(value, at, "0 … 1")
+    if not 0.0 <= result <= 1.0:
+        raise problem(f"got {shown(value)}; allowed: 0 … 1", at)
+    return result
+
+
+def sequence(value: object) -> Sequence[Any] | None:
+    """`value` as a list or tuple (an array of numpy as a list); None if it is none of these."""
+    plain = value.tolist() if hasattr(value, "tolist") else value
+    return plain if isinstance(plain, (list, tuple)) else None
+
+
+def to_vector(value: object) -> tuple[float, ...]:
+    """A list of finite numbers as a tuple of floats."""
+    entries = sequence(value)
+    if not entries:
+        example = f", such as [{value!r}]" if isinstance(value, (int, float)) and not isinstance(value, bool) else ""
+        raise problem(f"got {shown(value)}; allowed: a list of numbers{example}")
+    return tuple(number(entry, f"[{i}]") for i, entry in enumerate(entries))
+
+
+def to_matrix(value: object) -> tuple[tuple[float, ...], ...]:
+    """A list of rows of finite numbers, all of one length, as a tuple of tuples of floats."""
+    rows = [sequence(row) for row in sequence(value) or ()]
+    if not rows or any(row is None for row in rows):
+        raise problem(f"got {shown(value)}; allowed: nested arrays, one list for each row{_example(value)}")
+    result = tuple(
+        tuple(number(entry, f"[{i}][{j}]") for j, entry in enumerate(row or ())) for i, row in enumerate(rows)
+    )
+    for i, row in enumerate(result):
+        if not row or len(row) != len(result[0]):
+            wanted = f"{len(result[0])} numbers, as in row 0" if result[0] else "at least one number"
+            raise problem(f"got {len(row)} numbers; allowed: {wanted}", f"[{i}]")
+    return result
+
+
+def _example(value: object) -> str:
+    """The nested arrays that a number or a flat list may have been meant to be."""
+    flat = sequence(value)
+    if flat is None:
+        flat = [value]
+    if not flat or not all(isinstance(entry, (int, float)) and not isinstance(entry, bool) for entry in flat):
+        return ""
+    row = [list(flat)]
+    if len(flat) == 1:
+        return f", such as {row!r}"
+    return f", such as {shown([[entry] for entry in flat])} (a column) or {shown(row)} (a row)"
+
+
+def to_scalar_or_vector(value: object) -> float | tuple[float, ...]:
+    """A number, or a list of numbers."""
+    if sequence(value) is not None:
+        return to_vector(value)
+    return number(value, allowed="a number, or a list of numbers, one for each input channel")
+
+
+def size(matrix: Sequence[Sequence[float]]) -> tuple[int, int]:
+    """(rows, columns) of a matrix."""
+    return len(matrix), len(matrix[0])
+
+
+Vector = Annotated[tuple[float, ...], BeforeValidator(to_vector), Field(min_length=1)]
+Matrix = Annotated[tuple[tuple[float, ...], ...], BeforeValidator(to_matrix), Field(min_length=1)]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+ScalarOrVector = Annotated[
+    float | tuple[float, ...],
+    PlainValidator(to_scalar_or_vector),
+    WithJsonSchema(
+        {"anyOf": [{"type": "number"}, {"type": "array", "items": {"type": "number"}, "minItems": 1}]},
+    ),
+]

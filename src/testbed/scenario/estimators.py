@@ -1,0 +1,66 @@
+"""The estimators of a scenario, as far as they are known without their code."""
+
+import math
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import ConfigDict, Field, field_validator, model_validator
+
+from testbed.scenario.base import Part, problem, sequence, shown
+
+NAME_PATTERN = r"^[a-z][a-z0-9_-]{0,31}$"
+NAME_ALLOWED = "1 to 32 of a-z, 0-9, _ and -, a letter first"
+
+Name = Annotated[str, Field(pattern=NAME_PATTERN)]
+
+
+def _schema(schema: dict[str, Any]) -> None:
+    """In the file the options are keys of the estimator's own table."""
+    del schema["properties"]["options"]
+    schema["additionalProperties"] = True
+
+
+def _own_name(data: dict[str, Any]) -> Any:
+    return data["name"]
+
+
+class EstimatorSpec(Part):
+    """An estimator. Keys of its table that are not fields here are its `options`."""
+
+    model_config = ConfigDict(json_schema_extra=_schema)
+    reserved: ClassVar[tuple[str, ...]] = ("name", "kind", "acks", "until")
+
+    name: Name = Field(description="Name in the results; unique.")
+    kind: Name = Field(default_factory=_own_name, description="Which estimator it is; default its name.")
+    acks: Literal["none", "perfect"] | None = Field(
+        default=None, description="What it is told of the control packets; left out: that of [links.ack]."
+    )
+    until: int | None = Field(
+        default=None, ge=1, description="The last step at which it runs, 1 … steps; left out: the last step of all."
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="Every other key of its table.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gather_options(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        own = {key: value for key, value in data.items() if key in cls.model_fields}
+        own["options"] = {**data.get("options", {}), **{key: data[key] for key in data if key not in cls.model_fields}}
+        return own
+
+    @field_validator("options")
+    @classmethod
+    def _plain(cls, options: dict[str, Any]) -> dict[str, Any]:
+        return {key: _plain_value(value, key) for key, value in options.items()}
+
+
+def _plain_value(value: Any, at: str) -> Any:
+    """`value` if it is made of true/false, finite numbers, texts, lists and tables; a problem of validation if not."""
+    if isinstance(value, dict):
+        return {key: _plain_value(entry, f"{at}.{key}") for key, entry in value.items()}
+    entries = sequence(value)
+    if entries is not None:
+        return [_plain_value(entry, f"{at}[{i}]") for i, entry in enumerate(entries)]
+    if isinstance(value, (bool, int, str)) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    raise problem(f"got {shown(value)}; allowed: true or false, a finite number, a text, a list or a table", at)

@@ -1,0 +1,111 @@
+"""The inputs u_k, k = 0, 1, …: only their data. q is the number of input channels."""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import ConfigDict, Field, field_validator, model_validator
+
+from testbed.scenario.base import Matrix, Part, ScalarOrVector, Vector, problem, sequence, shown
+
+
+def _positive(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+    if any(entry <= 0 for entry in (value if isinstance(value, tuple) else (value,))):
+        raise problem(f"got {shown(value)}; allowed: more than 0")
+    return value
+
+
+class ConstantInput(Part):
+    """u_k = value."""
+
+    kind: Literal["constant"] = Field(default="constant", description="Kind of input.")
+    value: Vector = Field(description="The input, q numbers.")
+
+
+class ExponentialInput(Part):
+    """u_k = offset + amplitude * exp(-k / tau)."""
+
+    kind: Literal["exponential"] = Field(default="exponential", description="Kind of input.")
+    offset: ScalarOrVector = Field(default=0.0, description="What the input tends to: a number, or a list of q.")
+    amplitude: ScalarOrVector = Field(default=1.0, description="What decays: a number, or a list of q.")
+    tau: ScalarOrVector = Field(description="Steps in which it decays by the factor e, more than 0: a number, or q.")
+
+    _check_tau = field_validator("tau")(_positive)
+
+
+class SineInput(Part):
+    """u_k = offset + amplitude * sin(2 pi k / period + phase)."""
+
+    kind: Literal["sine"] = Field(default="sine", description="Kind of input.")
+    offset: ScalarOrVector = Field(default=0.0, description="Mean of the input: a number, or a list of q.")
+    amplitude: ScalarOrVector = Field(default=1.0, description="Amplitude: a number, or a list of q.")
+    period: ScalarOrVector = Field(description="Period in steps, more than 0: a number, or a list of q.")
+    phase: ScalarOrVector = Field(default=0.0, description="Phase at k = 0 in radians: a number, or a list of q.")
+
+    _check_period = field_validator("period")(_positive)
+
+
+class UniformInput(Part):
+    """u_k drawn from the uniform law on [low, high], afresh at each step, from the seed of the scenario."""
+
+    kind: Literal["uniform"] = Field(default="uniform", description="Kind of input.")
+    low: ScalarOrVector = Field(description="Lower bound: a number, or a list of q.")
+    high: ScalarOrVector = Field(description="Upper bound, not less than low: a number, or a list of q.")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "UniformInput":
+        lows = self.low if isinstance(self.low, tuple) else (self.low,)
+        highs = self.high if isinstance(self.high, tuple) else (self.high,)
+        if len(lows) == 1 or len(highs) == 1 or len(lows) == len(highs):
+            pairs = max(len(lows), len(highs))
+            for low, high in zip(lows * (pairs // len(lows)), highs * (pairs // len(highs)), strict=True):
+                if low > high:
+                    raise problem(
+                        f"got {shown(self.high)}; allowed: not less than low, which is {shown(self.low)}", "high"
+                    )
+        return self
+
+
+def _table_schema(schema: dict[str, Any]) -> None:
+    schema["properties"]["file"] = {
+        "type": "string",
+        "title": "File",
+        "description": "CSV file, a row of q numbers for each step; its path is relative to the scenario's folder.",
+    }
+    schema["required"] = ["kind"]
+    schema["oneOf"] = [{"required": ["values"]}, {"required": ["file"]}]
+
+
+class TableInput(Part):
+    """u_k = row k of a table. In the file: `file` (CSV, read by the loader) or `values`."""
+
+    model_config = ConfigDict(json_schema_extra=_table_schema)
+    other_keys: ClassVar[tuple[str, ...]] = ("file",)
+
+    kind: Literal["table"] = Field(default="table", description="Kind of input.")
+    values: Matrix = Field(description="A row of q numbers for each step k = 0, 1, …; at least as many as steps.")
+
+
+class FeedbackInput(Part):
+    """u_k = -gain x_hat_k: the loop is closed through an estimator."""
+
+    kind: Literal["feedback"] = Field(default="feedback", description="Kind of input.")
+    gain: Matrix = Field(description="Gain, q x n.")
+    estimator: str = Field(default="", description="Name of the estimator that closes the loop; default the first one.")
+
+
+Input = Annotated[
+    ConstantInput | ExponentialInput | SineInput | UniformInput | TableInput | FeedbackInput,
+    Field(discriminator="kind"),
+]
+
+
+def check_channels(source: Input, q: int) -> None:
+    """Check that every list of `source` has `q` entries, one for each channel; a problem of validation if not."""
+    for key in type(source).model_fields:
+        value = getattr(source, key)
+        if key in ("values", "gain"):
+            width = len(value[0]) if key == "values" else len(value)
+            unit = "numbers a row" if key == "values" else "rows"
+            if width != q:
+                raise problem(f"got {width} {unit}; allowed: {q}, the number of columns of system.B", key)
+        elif sequence(value) is not None and len(value) != q:
+            raise problem(f"got {len(value)} numbers; allowed: {q}, the number of columns of system.B", key)

@@ -1,0 +1,88 @@
+"""Reading a scenario: the file, the tables it refers to, and the errors of both."""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from testbed.errors import UsageError
+from testbed.scenario.explain import explain
+from testbed.scenario.models import Scenario
+from testbed.scenario.table import read_table, read_text
+
+_TLS_FILES = ("ca", "certificate", "key", "client_certificate", "client_key")
+
+
+def load_scenario(path: Path | str) -> Scenario:
+    """The scenario of a TOML file.
+
+    Raises UsageError, of one line, if the file cannot be read, is not TOML, or is not a scenario.
+    """
+    try:
+        text = read_text(Path(path))
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+    return parse_scenario(text, Path(path).parent, source=str(path))
+
+
+def parse_scenario(
+    dict_or_text: Mapping[str, Any] | str, base_dir: Path | str = ".", *, source: str = "scenario"
+) -> Scenario:
+    """The scenario of a TOML text or of its tables.
+
+    Relative paths in it are taken from `base_dir`. `source` is what errors call it. Raises UsageError, of one line.
+    """
+    try:
+        tables = _parse_toml(dict_or_text) if isinstance(dict_or_text, str) else dict(dict_or_text)
+        return Scenario.model_validate(_resolve_files(tables, Path(base_dir)))
+    except ValidationError as error:
+        raise UsageError(f"{source}: {explain(error)}") from None
+    except UsageError as error:
+        raise UsageError(f"{source}: {error}") from None
+
+
+def _parse_toml(text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"not valid TOML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise UsageError("not valid TOML: arrays or tables are nested too deeply") from None
+
+
+def _resolve_files(tables: dict[str, Any], base_dir: Path) -> dict[str, Any]:
+    """The tables with the CSV of a table input read in, and paths made absolute. What does not fit is left alone."""
+    result = dict(tables)
+    source = result.get("input")
+    if isinstance(source, dict) and source.get("kind") == "table":
+        result["input"] = _read_input_table(source, base_dir)
+    transport = result.get("transport")
+    if isinstance(transport, dict):
+        transport = _absolute(transport, ("users_file",), base_dir)
+        if isinstance(transport.get("tls"), dict):
+            transport["tls"] = _absolute(transport["tls"], _TLS_FILES, base_dir)
+        result["transport"] = transport
+    return result
+
+
+def _absolute(table: dict[str, Any], keys: tuple[str, ...], base_dir: Path) -> dict[str, Any]:
+    given = {key: table[key] for key in keys if isinstance(table.get(key), str) and table[key]}
+    return {**table, **{key: str((base_dir / path).absolute()) for key, path in given.items()}}
+
+
+def _read_input_table(source: dict[str, Any], base_dir: Path) -> dict[str, Any]:
+    if ("file" in source) == ("values" in source):
+        given = "both" if "file" in source else "neither"
+        raise UsageError(f"input: got {given} of file and values; allowed: exactly one of file, values")
+    if "file" not in source:
+        return source
+    file = source["file"]
+    if not isinstance(file, str) or not file:
+        raise UsageError(f"input.file: got {file!r}; allowed: the path of a CSV file")
+    try:
+        values = read_table(base_dir / file)
+    except UsageError as error:
+        raise UsageError(f"input.file: {file}: {error}") from None
+    return {**{key: value for key, value in source.items() if key != "file"}, "values": values}

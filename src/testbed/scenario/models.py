@@ -1,0 +1,94 @@
+"""The scenario as a whole."""
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, ValidationInfo, field_validator
+
+from testbed.errors import did_you_mean
+from testbed.scenario.base import Part, problem, shown, size
+from testbed.scenario.estimators import EstimatorSpec
+from testbed.scenario.inputs import ConstantInput, FeedbackInput, Input, TableInput, check_channels
+from testbed.scenario.links import Links
+from testbed.scenario.system import System
+from testbed.scenario.transport import Clock, Transport
+
+SEED_MAX = 2**63 - 1
+
+
+def _no_input(data: dict[str, Any]) -> ConstantInput | None:
+    """u = 0 if the system has an input, and nothing if it has none."""
+    system: System = data["system"]
+    return ConstantInput(value=(0.0,) * system.q) if system.q else None
+
+
+class Scenario(Part):
+    """Everything that determines a run: the same scenario and seed give the same results."""
+
+    later_keys: ClassVar[tuple[str, ...]] = ("uncertainty", "events")
+
+    name: str = Field(default="scenario", min_length=1, max_length=128, description="Name in the results.")
+    steps: int = Field(default=100, ge=1, description="Number of steps, k = 1 … steps.")
+    lanes: int = Field(default=1, ge=1, description="Number of independent realisations that run side by side.")
+    seed: int = Field(default=1, ge=0, le=SEED_MAX, description="Seed of every random draw.")
+    record: Literal["first", "all", "none"] = Field(default="first", description="Which lanes the recording keeps.")
+    bounds: bool = Field(default=True, description="Whether the bounds of the error covariance are computed.")
+    clock: Clock = Field(default_factory=Clock, description="How time passes.")
+    system: System = Field(description="The system.")
+    estimators: Annotated[tuple[EstimatorSpec, ...], Field(strict=False)] = Field(
+        default=(), description="The estimators, all on the same packets."
+    )
+    input: Input | None = Field(default_factory=_no_input, description="The input u; default zero. Only with system.B.")
+    links: Links = Field(default_factory=Links, description="The links between the parts.")
+    transport: Transport = Field(default_factory=Transport, description="How the processes of a run talk.")
+
+    @field_validator("estimators")
+    @classmethod
+    def _check_estimators(cls, specs: tuple[EstimatorSpec, ...], info: ValidationInfo) -> tuple[EstimatorSpec, ...]:
+        names: set[str] = set()
+        for i, spec in enumerate(specs):
+            if spec.name in names:
+                raise problem(f"got {spec.name!r} a second time; allowed: a name of its own", f"[{i}].name")
+            names.add(spec.name)
+            steps = info.data.get("steps")
+            if spec.until is not None and steps is not None and spec.until > steps:
+                raise problem(f"got {spec.until}; allowed: 1 … {steps}, the steps of the scenario", f"[{i}].until")
+        return specs
+
+    @field_validator("input")
+    @classmethod
+    def _check_input(cls, source: Input | None, info: ValidationInfo) -> Input | None:
+        system: System | None = info.data.get("system")
+        if system is None:
+            return source
+        if source is None:
+            return _no_input(info.data)
+        if system.B is None:
+            raise problem(f"got kind {source.kind!r}, but system.B is not given; allowed: [input] only with system.B")
+        check_channels(source, system.q)
+        if isinstance(source, TableInput) and len(source.values) < info.data.get("steps", 0):
+            steps = info.data["steps"]
+            raise problem(f"got {len(source.values)} rows; allowed: at least {steps}, one for each step", "values")
+        if isinstance(source, FeedbackInput):
+            return _closed_loop(source, system, info)
+        return source
+
+
+def _closed_loop(source: FeedbackInput, system: System, info: ValidationInfo) -> FeedbackInput:
+    """`source` checked against the rest of the scenario, with the name of its estimator."""
+    rows, columns = size(source.gain)
+    if columns != system.n:
+        raise problem(f"got {rows} × {columns}; allowed: {system.q} × {system.n}", "gain")
+    if "estimators" not in info.data or "steps" not in info.data:
+        return source
+    specs: tuple[EstimatorSpec, ...] = info.data["estimators"]
+    if not specs:
+        raise problem("got no [[estimators]]; allowed: feedback only through an estimator of the scenario", "estimator")
+    names = [spec.name for spec in specs]
+    name = source.estimator or names[0]
+    if name not in names:
+        hint = did_you_mean(name, names)
+        raise problem(f"got {shown(name)}; allowed: {', '.join(names)}{hint}", "estimator")
+    until, steps = specs[names.index(name)].until, info.data["steps"]
+    if until is not None and until < steps:
+        raise problem(f"got {name!r}, which ends at step {until}; allowed: one that runs to step {steps}", "estimator")
+    return source.model_copy(update={"estimator": name})

@@ -1,0 +1,106 @@
+"""The clock of a run, and the transport between its processes."""
+
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, field_validator, model_validator
+
+from testbed.scenario.base import Part, problem, shown
+from testbed.scenario.durations import Duration, parse_duration
+
+
+class Clock(Part):
+    """How time passes. `period_ns` is the period in nanoseconds."""
+
+    mode: Literal["virtual"] = Field(
+        default="virtual", description="virtual: simulated time, as fast as the processes can go."
+    )
+    period: Duration = Field(default="10 ms", description="Simulated time of one step, a duration such as '10 ms'.")
+    window: int | None = Field(
+        default=None, ge=1, description="Steps that may be in flight at once, 1 or more; left out: chosen by the run."
+    )
+
+    @field_validator("mode", mode="before")
+    @classmethod
+    def _not_yet_real(cls, mode: object) -> object:
+        if mode == "real":
+            raise problem("got 'real'; not supported by this version; allowed: virtual")
+        return mode
+
+    @property
+    def period_ns(self) -> int:
+        """The period in nanoseconds."""
+        return parse_duration(self.period)
+
+
+class Tls(Part):
+    """TLS between the processes. Paths are relative to the scenario's folder; resolved, they are absolute."""
+
+    ca: str = Field(min_length=1, description="File of the authority's certificate (PEM).")
+    certificate: str = Field(min_length=1, description="File of the router's certificate (PEM).")
+    key: str = Field(min_length=1, description="File of the router's private key (PEM).")
+    client_certificate: str | None = Field(
+        default=None, min_length=1, description="File of the clients' certificate (PEM); given: mutual TLS."
+    )
+    client_key: str | None = Field(default=None, min_length=1, description="File of the clients' private key (PEM).")
+
+    @model_validator(mode="after")
+    def _client_pair(self) -> "Tls":
+        if (self.client_certificate is None) != (self.client_key is None):
+            given, lacking = "client_certificate", "client_key"
+            if self.client_certificate is None:
+                given, lacking = lacking, given
+            raise problem(f"got {given} without {lacking}; allowed: both or neither", given)
+        return self
+
+
+_ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[^\s/:\[\]]+):([0-9]{1,5})", re.ASCII)
+
+
+def _endpoint(value: Any) -> Any:
+    if value is None:
+        return None
+    match = _ENDPOINT.fullmatch(value) if isinstance(value, str) else None
+    if match is None or not 1 <= int(match[3]) <= 65535:
+        raise problem(f"got {shown(value)}; allowed: tcp/HOST:PORT or tls/HOST:PORT, PORT 1 … 65535")
+    return value
+
+
+class Transport(Part):
+    """How the processes of a run talk. `deadline_ns` is the deadline in nanoseconds."""
+
+    endpoint: Annotated[str | None, BeforeValidator(_endpoint)] = Field(
+        default=None,
+        description="Where the run listens, such as tcp/127.0.0.1:7447; left out: this host only, on a free port.",
+    )
+    deadline: Duration = Field(
+        default="10 s", description="A run without progress for that long has failed; a duration such as '10 s'."
+    )
+    lanes_per_packet: int | None = Field(
+        default=None, ge=1, description="The most lanes that one packet carries, 1 or more; left out: all of them."
+    )
+    tls: Tls | None = Field(default=None, description="Encryption; left out: none.")
+    user: str | None = Field(default=None, min_length=1, description="User name of the processes.")
+    password_env: str | None = Field(
+        default=None, min_length=1, description="Name of the environment variable that holds the user's password."
+    )
+    users_file: str | None = Field(
+        default=None,
+        min_length=1,
+        description="File of the users that may connect, a line user:password each; relative to the scenario's folder.",
+    )
+
+    @property
+    def deadline_ns(self) -> int:
+        """The deadline in nanoseconds."""
+        return parse_duration(self.deadline)
+
+    @model_validator(mode="after")
+    def _agree(self) -> "Transport":
+        if self.endpoint is not None and self.endpoint.startswith("tls/") != (self.tls is not None):
+            wanted = "tls/… with [transport.tls], tcp/… without"
+            raise problem(f"got {shown(self.endpoint)}; allowed: {wanted}", "endpoint")
+        if (self.user is None) != (self.password_env is None):
+            given = "user" if self.password_env is None else "password_env"
+            raise problem(f"got only {given}; allowed: user and password_env, both or neither", given)
+        return self
