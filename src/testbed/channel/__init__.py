@@ -1,0 +1,1 @@
+"""Links: what is lost on the way, as pure processes and as a service."""

@@ -1,0 +1,136 @@
+"""Loss processes: which packets arrive. One draw a packet and lane, indexed by the packet's number."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from testbed.numerics.lanes import Mask
+from testbed.numerics.streams import Stream
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The two-state Markov chain of arrivals (1 = delivered), clocked by packets.
+
+    recovery: P(0→1); failure: P(1→0); start: P(first packet delivered). A Bernoulli link of arrival rate λ is
+    Chain(λ, 1 − λ, λ). The state drawn for a packet decides its fate; the chain then moves to the next packet.
+    """
+
+    recovery: float
+    failure: float
+    start: float
+
+    @classmethod
+    def lossless(cls) -> Chain:
+        return cls(1.0, 0.0, 1.0)
+
+    @classmethod
+    def bernoulli(cls, arrival: float) -> Chain:
+        return cls(arrival, 1.0 - arrival, arrival)
+
+    @classmethod
+    def markov(cls, recovery: float, failure: float, start: float | None = None) -> Chain:
+        """Stationary at the first packet unless ``start`` is given."""
+        return cls(recovery, failure, recovery / (recovery + failure) if start is None else start)
+
+    @property
+    def never_loses(self) -> bool:
+        return self.start == 1.0 and self.failure == 0.0
+
+    @property
+    def independent(self) -> bool:
+        """True when arrivals are independent and identically distributed."""
+        stays = 1.0 - self.failure
+        return abs(self.recovery - stays) <= 1e-15 and abs(self.start - self.recovery) <= 1e-15
+
+    @property
+    def arrival(self) -> float:
+        """Stationary arrival probability."""
+        return self.recovery / (self.recovery + self.failure)
+
+    @property
+    def mean_burst(self) -> float | None:
+        """Mean length of a run of losses, 1/recovery; None if losses never end."""
+        return 1.0 / self.recovery if self.recovery > 0.0 else None
+
+    def arrival_given(self, last: Mask | None) -> float | np.ndarray:
+        """P(this packet is delivered | the fate of the one before); ``None`` before the first packet."""
+        if last is None:
+            return self.start
+        if isinstance(last, bool):
+            return 1.0 - self.failure if last else self.recovery
+        return np.where(last, 1.0 - self.failure, self.recovery)
+
+
+class LossProcess:
+    """Draws the fate of packet 0, 1, 2, … for a block of lanes."""
+
+    def __init__(self, chain: Chain, stream: Stream, lanes: int) -> None:
+        self._chain, self._stream, self._lanes = chain, stream, lanes
+        self._last: Mask | None = None
+
+    def next(self, number: int) -> Mask:
+        """Arrival mask of packet ``number``: a ``bool`` for one lane, else a boolean array of shape (M,)."""
+        if self._chain.never_loses:
+            return True if self._lanes == 1 else np.ones(self._lanes, dtype=np.bool_)
+        (uniform,) = self._stream.uniforms(number)
+        self._last = uniform < self._chain.arrival_given(self._last)
+        return self._last
+
+
+@dataclass
+class LossCounts:
+    """What happened to the packets of a link, counted over lane-packets; the books balance by construction of the sums.
+
+    ``transitions[a][b]``: how often a packet of fate b followed one of fate a in the same lane.
+    """
+
+    sent: int = 0
+    delivered: int = 0
+    bursts: int = 0
+    transitions: list[list[int]] = field(default_factory=lambda: [[0, 0], [0, 0]])
+    _last: dict[int, Mask] = field(default_factory=dict)
+
+    def count(self, lane: int, arrived: Mask) -> None:
+        """Take in the fate of one packet of the block that begins at ``lane``."""
+        last = self._last.get(lane)
+        self._last[lane] = arrived
+        if isinstance(arrived, bool):
+            self.sent += 1
+            self.delivered += arrived
+            if last is not None:
+                self.transitions[last][arrived] += 1
+            self.bursts += (not arrived) and last is not False
+            return
+        lanes, ones = len(arrived), int(np.count_nonzero(arrived))
+        self.sent += lanes
+        self.delivered += ones
+        if last is None:
+            self.bursts += lanes - ones
+            return
+        before, both = int(np.count_nonzero(last)), int(np.count_nonzero(last & arrived))
+        t = self.transitions
+        t[1][1] += both
+        t[1][0] += before - both
+        t[0][1] += ones - both
+        t[0][0] += lanes - before - ones + both
+        self.bursts += before - both
+
+    @property
+    def dropped(self) -> int:
+        return self.sent - self.delivered
+
+    def as_counters(self) -> dict[str, int]:
+        t = self.transitions
+        return {
+            "sent": self.sent,
+            "delivered": self.delivered,
+            "dropped": self.dropped,
+            "bursts": self.bursts,
+            "00": t[0][0],
+            "01": t[0][1],
+            "10": t[1][0],
+            "11": t[1][1],
+        }

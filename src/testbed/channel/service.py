@@ -1,0 +1,83 @@
+"""A link as a service: takes what is published on its ``sent`` key and publishes what it delivers on ``delivered``."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from testbed.channel.chains import chain_of
+from testbed.channel.loss import LossCounts, LossProcess
+from testbed.numerics.lanes import Mask, any_of
+from testbed.numerics.streams import Stream
+from testbed.scenario import Link, NoLoss, Scenario
+from testbed.wire.keys import LinkName
+from testbed.wire.messages import Acknowledgement, Control, Observation, Packet
+from testbed.wire.node import Node
+from testbed.wire.setup import Setup
+
+_TYPES: dict[LinkName, tuple[type[Packet], str, str, int]] = {
+    "control": (Control, "controller", "u", 0),
+    "observation": (Observation, "plant", "y", 1),
+    "ack": (Acknowledgement, "plant", "nu", 1),
+}
+"""Type, sender, content and the step of packet 0."""
+
+
+def role_of(link: LinkName) -> str:
+    return f"link.{link}"
+
+
+def builder(link: LinkName) -> Any:
+    """What builds the service of one link."""
+    return partial(LinkService, link=link)
+
+
+def loss_process(scenario: Scenario, link: LinkName, lane: int, lanes: int) -> LossProcess:
+    """The loss process of a block of lanes of a link; the same draws wherever it runs."""
+    settings = getattr(scenario.links, link)
+    loss = settings.loss if isinstance(settings, Link) or settings.mode == "link" else NoLoss()
+    stream = Stream(scenario.seed, role_of(link), "loss", width=1, lane=lane, lanes=lanes)
+    return LossProcess(chain_of(loss), stream, lanes)
+
+
+class LinkService:
+    """Emulates one link, lane by lane.
+
+    A packet that arrives in some lanes is passed on with its mask and zeros elsewhere; one that arrives in none is
+    passed on as a bare mask, which tells the receiver that the step is over (virtual time has no other way).
+    """
+
+    def __init__(self, node: Node, setup: Setup, *, link: LinkName) -> None:
+        model, sender, self._content, self._first = _TYPES[link]
+        self._losses = {lane: loss_process(setup.scenario, link, lane, lanes) for lane, lanes in setup.blocks}
+        self._counts = LossCounts()
+        self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
+        node.on(node.keys.sent(link), model, sender, self._pass_on)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        return self._counts.as_counters()
+
+    def _pass_on(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
+        lane = packet.lane
+        arrived = self._losses[lane].next(packet.step - self._first)
+        self._counts.count(lane, arrived)
+        self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
+
+    def _content_of(self, arrays: dict[str, NDArray[Any]], arrived: Mask) -> dict[str, NDArray[Any]]:
+        if not any_of(arrived):
+            lanes = 1 if isinstance(arrived, bool) else len(arrived)
+            return {"mask": np.zeros(lanes, dtype=np.uint8)}
+        content = arrays[self._content]
+        if isinstance(arrived, bool):
+            return {self._content: content, "mask": _ARRIVED}
+        if not arrived.all():
+            kept = arrived if content.ndim == 1 else arrived[:, None]
+            content = np.where(kept, content, content.dtype.type(0))
+        return {self._content: content, "mask": arrived.astype(np.uint8)}
+
+
+_ARRIVED = np.ones(1, dtype=np.uint8)

@@ -1,0 +1,1 @@
+"""Estimators: one a file, pure; the registry; the service."""

@@ -1,0 +1,37 @@
+"""The bounds Pᴬ_k ≤ E_Y[P_k] ≤ S_k of M Theorem 3 (theory.md 3.6), on the losses of each lane."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from testbed.estimator.model import Model
+from testbed.estimator.riccati import Gain, phi, predict
+from testbed.numerics.lanes import Floats, Matrix, constant, mask_of, matrices_of
+
+
+class Bounds:
+    """Lower: the ACK covariance Pᴬ. Upper: S, for an input with B u_k u_k' B' ≤ U for all k; none without U."""
+
+    def __init__(self, model: Model, U: Floats | None, lanes: int) -> None:
+        self._model, self._lanes = model, lanes
+        _, self._lower = model.prior(lanes)
+        self._upper: Matrix | None = self._lower if U is not None else None
+        self._upper_noise = constant(model.Q if U is None else model.Q + 0.25 * U)
+
+    def step(self, arrived: NDArray[Any]) -> tuple[Floats, Floats | None]:
+        """Pᴬ_k and S_k, each (M, n, n), after the observations ``arrived`` (M,) of step k."""
+        lower, upper = self.components(arrived)
+        return matrices_of(lower, self._lanes), None if upper is None else matrices_of(upper, self._lanes)
+
+    def components(self, arrived: NDArray[Any]) -> tuple[Matrix, Matrix | None]:
+        model, gamma = self._model, mask_of(arrived)
+        self._lower = self._next(self._lower, model.noise, gamma)
+        if self._upper is not None:
+            self._upper = self._next(self._upper, self._upper_noise, gamma)
+        return self._lower, self._upper
+
+    def _next(self, p: Matrix, noise: Any, gamma: Any) -> Matrix:
+        covariance = predict(self._model.a, p, noise)
+        return phi(covariance, Gain(covariance, self._model.c, self._model.sensor_noise), gamma)

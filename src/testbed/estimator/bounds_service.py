@@ -1,0 +1,45 @@
+"""The bounds of the error covariance as a service, on the same observation losses as the estimators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from testbed.errors import RunFailed
+from testbed.estimator.bounds import Bounds
+from testbed.estimator.registry import model_of
+from testbed.numerics.lanes import Component, trace
+from testbed.plant.inputs import control_bound
+from testbed.wire.codec import all_finite
+from testbed.wire.messages import BoundsMessage, Observation
+from testbed.wire.node import Node
+from testbed.wire.setup import Setup
+
+ROLE = "bounds"
+
+
+class BoundsService:
+    """Publishes the traces of Pᴬ_k and S_k of every lane."""
+
+    def __init__(self, node: Node, setup: Setup) -> None:
+        model, bound = model_of(setup.scenario), control_bound(setup.scenario)
+        self._blocks = {lane: Bounds(model, bound, lanes) for lane, lanes in setup.blocks}
+        self._send = node.sender(node.keys.bounds, BoundsMessage)
+        self.counters: dict[str, int] = {}
+        node.on(node.keys.delivered("observation"), Observation, "link.observation", self._take)
+
+    def _take(self, packet: Observation, arrays: dict[str, NDArray[Any]]) -> None:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            lower, upper = self._blocks[packet.lane].components(arrays["mask"])
+        traces = {"trace_lower": _lanes(trace(lower), packet.lanes)}
+        if upper is not None:
+            traces["trace_upper"] = _lanes(trace(upper), packet.lanes)
+        if not all(all_finite(values) for values in traces.values()):
+            raise RunFailed(f"the bounds left the range of floating-point numbers at step {packet.step}")
+        self._send(packet.step, packet.lane, packet.lanes, traces)
+
+
+def _lanes(component: Component, lanes: int) -> NDArray[np.float64]:
+    return np.array(np.broadcast_to(component, (lanes,)))

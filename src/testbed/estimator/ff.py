@@ -1,0 +1,66 @@
+"""FF: the fast filter of F (eq. 24, theory.md 3.3), for unacknowledged i.i.d. control losses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from testbed.errors import UsageError
+from testbed.estimator.model import Ack, Estimate, Model, newest_ack
+from testbed.estimator.riccati import Gain, phi, predict
+from testbed.numerics.lanes import (
+    Component,
+    Floats,
+    add,
+    add_outer,
+    any_of,
+    constant_times,
+    mask_of,
+    scale,
+    vector_of,
+    where,
+    where_symmetric,
+    where_vector,
+)
+
+
+class Ff:
+    """Linear: the control enters with its mean, the gain is the ACK filter's.
+
+    An ACK of ν_{k−1} in time replaces the mean ν̄ of that packet by ν itself, so that with every ACK it is KFIO.
+    """
+
+    def __init__(self, model: Model, lanes: int) -> None:
+        if not model.control.independent:
+            raise UsageError("estimator 'ff' holds for i.i.d. control losses only; for Markov losses use 'aoe' or 'oe'")
+        self._model, self._lanes = model, lanes
+        self._x, self._p = model.prior(lanes)
+        self._ack_p = self._p
+        self._k = 0
+        self.counters: dict[str, int] = {}
+
+    def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
+        """Older ACKs than that of ν_{k−1} cannot be used and are counted."""
+        model, gamma = self._model, mask_of(arrived)
+        self._k += 1
+        rate = self._rate(acks)
+        mean = constant_times(model.a, self._x)
+        covariance = predict(model.a, self._p, model.noise)
+        if model.q:
+            push = model.control_effect(vector_of(u))
+            mean = add(mean, scale(rate, push))
+            covariance = add_outer(covariance, rate * (1.0 - rate), push)
+        ack_covariance = predict(model.a, self._ack_p, model.noise)
+        gain = Gain(ack_covariance, model.c, model.sensor_noise)
+        self._ack_p = phi(ack_covariance, gain, gamma)
+        self._x, self._p = mean, covariance
+        if any_of(gamma):
+            self._x = where_vector(gamma, gain.correct(mean, vector_of(y)), mean)
+            self._p = where_symmetric(gamma, gain.joseph(covariance), covariance)
+        return Estimate(self._x, self._p, self._lanes)
+
+    def _rate(self, acks: tuple[Ack, ...]) -> Component:
+        ack = newest_ack(acks, self._k - 1, self.counters)
+        rate = self._model.control.start
+        return rate if ack is None else where(ack[0], ack[1], rate)

@@ -1,0 +1,66 @@
+"""KFIO: the Kalman filter with intermittent observations and known control losses (theory.md 3.1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from testbed.estimator.errors import MissingAck
+from testbed.estimator.model import Ack, Estimate, Model, newest_ack
+from testbed.estimator.riccati import Gain, phi, predict
+from testbed.numerics.lanes import (
+    Component,
+    Floats,
+    Vector,
+    all_of,
+    any_of,
+    constant_times,
+    mask_of,
+    vector_of,
+    where_vector,
+)
+
+
+class Kfio:
+    """Optimal when every ν_{k−1} is known at step k.
+
+    ν need not be acknowledged where the control link never loses or where B u = 0.
+    """
+
+    def __init__(self, model: Model, lanes: int) -> None:
+        self._model, self._lanes = model, lanes
+        self._x, self._p = model.prior(lanes)
+        self._k = 0
+        self.counters: dict[str, int] = {}
+
+    def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
+        """Raises MissingAck where ν_{k−1} matters and is not known."""
+        model, gamma = self._model, mask_of(arrived)
+        self._k += 1
+        push = model.control_effect(vector_of(u)) if model.q else []
+        nu = self._nu(push, acks)
+        mean = constant_times(model.a, self._x)
+        if push:
+            mean = [m + nu * b for m, b in zip(mean, push, strict=True)]
+        covariance = predict(model.a, self._p, model.noise)
+        gain = Gain(covariance, model.c, model.sensor_noise)
+        self._p = phi(covariance, gain, gamma)
+        self._x = where_vector(gamma, gain.correct(mean, vector_of(y)), mean) if any_of(gamma) else mean
+        return Estimate(self._x, self._p, self._lanes)
+
+    def _nu(self, push: Vector, acks: tuple[Ack, ...]) -> Component:
+        ack = newest_ack(acks, self._k - 1, self.counters)
+        if self._model.control.never_loses:
+            return 1.0
+        known, nu = ack if ack is not None else (False, 0.0)
+        if all_of(known):
+            return nu
+        idle = np.all([np.asarray(b) == 0.0 for b in push], axis=0) if push else np.True_
+        if not np.all(known | idle):
+            raise MissingAck(
+                f"kfio needs the ACK of control packet {self._k - 1} at step {self._k} and none has come; "
+                'give it acks = "perfect", or use aoe, ff or oe'
+            )
+        return nu

@@ -1,0 +1,136 @@
+"""What an estimator is told about plant and links, and what passes between it and its service."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from testbed.channel.loss import Chain
+from testbed.numerics.lanes import (
+    Component,
+    Constant,
+    Floats,
+    Mask,
+    Matrix,
+    Vector,
+    array_of,
+    constant,
+    constant_times,
+    full_matrix,
+    full_vector,
+    matrices_of,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """x⁺ = A x + ν B u + w, y = C x + v (theory.md section 1); Q with G already applied.
+
+    A (n, n), B (n, q) or None, C (p, n), Q (n, n), R (p, p), x0_mean (n,), P0 (n, n); control: law of ν_0, ν_1, …
+    """
+
+    A: Floats
+    C: Floats
+    Q: Floats
+    R: Floats
+    x0_mean: Floats
+    P0: Floats
+    B: Floats | None = None
+    control: Chain = field(default_factory=Chain.lossless)
+
+    @property
+    def n(self) -> int:
+        return int(self.A.shape[0])
+
+    @property
+    def p(self) -> int:
+        return int(self.C.shape[0])
+
+    @property
+    def q(self) -> int:
+        return 0 if self.B is None else int(self.B.shape[1])
+
+    @cached_property
+    def a(self) -> Constant:
+        return constant(self.A)
+
+    @cached_property
+    def b(self) -> Constant:
+        return tuple(() for _ in range(self.n)) if self.B is None else constant(self.B)
+
+    @cached_property
+    def c(self) -> Constant:
+        return constant(self.C)
+
+    @cached_property
+    def noise(self) -> Constant:
+        """Q as a constant."""
+        return constant(self.Q)
+
+    @cached_property
+    def sensor_noise(self) -> Constant:
+        """R as a constant."""
+        return constant(self.R)
+
+    def control_effect(self, u: Vector) -> Vector:
+        """B u."""
+        return constant_times(self.b, u)
+
+    def prior(self, lanes: int) -> tuple[Vector, Matrix]:
+        """x̄_0 and P_0 in every lane."""
+        return full_vector(self.x0_mean, lanes), full_matrix(self.P0, lanes)
+
+
+@dataclass(frozen=True)
+class Ack:
+    """What became known about control packet j: ν of shape (M,), where ``known`` (M,) is set."""
+
+    j: int
+    nu: NDArray[Any]
+    known: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """x_hat (M, n) and P (M, n, n) at one step, from components."""
+
+    x: Vector
+    p: Matrix
+    lanes: int
+
+    @property
+    def x_hat(self) -> Floats:
+        return array_of(self.x, self.lanes)
+
+    @property
+    def P(self) -> Floats:
+        return matrices_of(self.p, self.lanes)
+
+
+class Estimator(Protocol):
+    """One step = the move from k − 1 to k, then the observation of k."""
+
+    counters: dict[str, int]
+
+    def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
+        """u (M, q) as sent, y (M, p) with any finite value where nothing arrived, arrived (M,).
+
+        Raises MissingAck or TooManyHistories where the estimator's definition has no answer.
+        """
+        ...
+
+
+def newest_ack(acks: tuple[Ack, ...], j: int, counters: dict[str, int]) -> tuple[Mask, Component] | None:
+    """(known, ν) of control packet j if an ACK of it came; ACKs of older packets are counted as late."""
+    found = None
+    for ack in acks:
+        if ack.j == j:
+            known, nu = ack.known.astype(np.bool_), ack.nu.astype(np.float64)
+            found = (bool(known[0]), float(nu[0])) if len(known) == 1 else (known, nu)
+        else:
+            counters["late_acks"] = counters.get("late_acks", 0) + int(np.count_nonzero(ack.known))
+    return found

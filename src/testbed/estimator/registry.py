@@ -1,0 +1,96 @@
+"""Estimators by name: those of the testbed and those that other packages register.
+
+A package registers its own under the entry-point group ``testbed.estimators``; the object is called with
+(model, lanes, **options), as the classes here are.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, get_type_hints
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from testbed.channel.chains import chain_of
+from testbed.errors import UsageError, did_you_mean
+from testbed.estimator.model import Estimator, Model
+from testbed.scenario import Scenario
+
+_BUILT_IN = {
+    "aoe": "testbed.estimator.aoe:Aoe",
+    "ff": "testbed.estimator.ff:Ff",
+    "kfio": "testbed.estimator.kfio:Kfio",
+    "oe": "testbed.estimator.oe:Oe",
+}
+GROUP = "testbed.estimators"
+
+
+def kinds() -> list[str]:
+    """All names that ``create`` knows."""
+    return sorted({*_BUILT_IN, *(point.name for point in entry_points(group=GROUP))})
+
+
+def create(kind: str, model: Model, *, lanes: int, options: Mapping[str, Any] | None = None) -> Estimator:
+    """An estimator for ``lanes`` lanes.
+
+    Raises UsageError for an unknown kind or option, or where the estimator does not hold for the model.
+    """
+    factory = _factory(kind)
+    return factory(model, lanes, **_checked(kind, factory, dict(options or {})))
+
+
+def model_of(scenario: Scenario) -> Model:
+    """What estimators know of a scenario."""
+    system = scenario.system
+    g = np.eye(system.n) if system.G is None else np.array(system.G)
+    return Model(
+        A=np.array(system.A),
+        B=None if system.B is None else np.array(system.B),
+        C=np.array(system.C),
+        Q=g @ np.array(system.Q) @ g.T,
+        R=np.array(system.R),
+        x0_mean=np.array(system.x0_mean),
+        P0=np.array(system.P0),
+        control=chain_of(scenario.links.control.loss),
+    )
+
+
+def _factory(kind: str) -> Callable[..., Estimator]:
+    if kind in _BUILT_IN:
+        module, name = _BUILT_IN[kind].split(":")
+        found: Callable[..., Estimator] = getattr(import_module(module), name)
+        return found
+    for point in entry_points(group=GROUP, name=kind):
+        loaded: Callable[..., Estimator] = point.load()
+        return loaded
+    raise UsageError(f"unknown estimator {kind!r}; allowed: {', '.join(kinds())}{did_you_mean(kind, kinds())}")
+
+
+def _checked(kind: str, factory: Callable[..., Estimator], options: dict[str, Any]) -> dict[str, Any]:
+    """Options as the factory's signature wants them: parameters after (model, lanes), by name and type."""
+    parameters = list(inspect.signature(factory).parameters.values())[2:]
+    hints = get_type_hints(factory.__init__ if inspect.isclass(factory) else factory, include_extras=True)
+    allowed = [parameter.name for parameter in parameters]
+    for name in options:
+        if name not in allowed:
+            listed = ", ".join(allowed) if allowed else "none"
+            raise UsageError(
+                f"estimator {kind!r}: unknown option {name!r}; allowed: {listed}{did_you_mean(name, allowed)}"
+            )
+    for parameter in parameters:
+        if parameter.name not in options and parameter.default is inspect.Parameter.empty:
+            raise UsageError(f"estimator {kind!r}: option {parameter.name!r} is missing")
+    try:
+        return {
+            name: TypeAdapter(hints.get(name, Any)).validate_python(value, strict=True)
+            for name, value in options.items()
+        }
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        given = first["input"]
+        name = next(n for n, v in options.items() if v is given or v == given)
+        raise UsageError(f"estimator {kind!r}: {name}: got {given!r}; {first['msg'].lower()}") from None

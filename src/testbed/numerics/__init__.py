@@ -1,0 +1,1 @@
+"""Arithmetic that gives every lane the same bits, however the lanes are split."""

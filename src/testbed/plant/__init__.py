@@ -1,0 +1,1 @@
+"""The plant: dynamics, sensor, actuator; the inputs and the controller."""

@@ -1,0 +1,76 @@
+"""The inputs u_k of theory.md section 1, and the bound U ≥ B u_k u_k' B' that the upper bound S needs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from testbed.numerics.lanes import Floats, array_of
+from testbed.numerics.streams import Stream
+from testbed.scenario import (
+    ConstantInput,
+    ExponentialInput,
+    FeedbackInput,
+    Scenario,
+    SineInput,
+    TableInput,
+    UniformInput,
+)
+
+InputSource = Callable[[int], Floats]
+"""k → u_k of shape (lanes, q), the same for the same k."""
+
+
+def open_loop(scenario: Scenario, lane: int, lanes: int) -> InputSource:
+    """The input of the lanes lane … lane + lanes − 1; it does not depend on estimates."""
+    source, q = scenario.input, scenario.system.q
+    if isinstance(source, FeedbackInput):
+        raise TypeError("a feedback input depends on the estimate")
+    if isinstance(source, UniformInput):
+        stream = Stream(scenario.seed, "controller", "input", width=q, lane=lane, lanes=lanes)
+        low, high = _channels(source.low, q), _channels(source.high, q)
+        return lambda k: low + (high - low) * array_of(stream.uniforms(k), lanes)
+    return lambda k: np.tile(deterministic(scenario, k), (lanes, 1))
+
+
+def deterministic(scenario: Scenario, k: int) -> Floats:
+    """u_k of shape (q,) of an input that is the same in every lane."""
+    source, q = scenario.input, scenario.system.q
+    if source is None:
+        return np.zeros(q)
+    if isinstance(source, ConstantInput):
+        return np.array(source.value)
+    if isinstance(source, ExponentialInput):
+        decay = np.exp(-k / _channels(source.tau, q))
+        return _channels(source.offset, q) + _channels(source.amplitude, q) * decay
+    if isinstance(source, SineInput):
+        angle = 2.0 * np.pi * k / _channels(source.period, q) + _channels(source.phase, q)
+        return _channels(source.offset, q) + _channels(source.amplitude, q) * np.sin(angle)
+    if isinstance(source, TableInput):
+        return np.array(source.values[k])
+    raise TypeError(f"input {source.kind!r} is not the same in every lane")
+
+
+def control_bound(scenario: Scenario) -> Floats | None:
+    """U (n, n) with U ≥ B u_k u_k' B' for the control of every step; None where no bound is known.
+
+    For one channel it is tight; for several, u u' ≤ ‖u‖² I is used.
+    """
+    source, q = scenario.input, scenario.system.q
+    if isinstance(source, FeedbackInput):
+        return None
+    b = np.array(scenario.system.B) if scenario.system.B is not None else np.zeros((scenario.system.n, 0))
+    if isinstance(source, ConstantInput):
+        push = b @ np.array(source.value)
+        return np.outer(push, push)
+    if isinstance(source, UniformInput):
+        largest = np.maximum(np.abs(_channels(source.low, q)), np.abs(_channels(source.high, q)))
+        peak = float(largest @ largest)
+    else:
+        peak = max(float(u @ u) for u in (deterministic(scenario, k) for k in range(scenario.steps)))
+    return np.asarray(peak * (b @ b.T))
+
+
+def _channels(value: float | tuple[float, ...], q: int) -> Floats:
+    return np.broadcast_to(np.asarray(value, dtype=np.float64), (q,))

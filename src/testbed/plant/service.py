@@ -1,0 +1,44 @@
+"""The plant as a service: takes control packets from its link, publishes observation, ACK and truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from testbed.errors import RunFailed
+from testbed.numerics.lanes import mask_of
+from testbed.plant.dynamics import Plant, bits
+from testbed.wire.codec import all_finite
+from testbed.wire.messages import Acknowledgement, Control, Observation, Truth
+from testbed.wire.node import Node
+from testbed.wire.setup import Setup
+
+ROLE = "plant"
+
+
+class PlantService:
+    """One Plant for each block of lanes."""
+
+    def __init__(self, node: Node, setup: Setup) -> None:
+        keys = node.keys
+        self._plants = {lane: Plant(setup.scenario, lane, lanes) for lane, lanes in setup.blocks}
+        self._next = dict.fromkeys(self._plants, 0)
+        self._truth = node.sender(keys.truth, Truth)
+        self._ack = node.sender(keys.sent("ack"), Acknowledgement, tap=True)
+        self._observe = node.sender(keys.sent("observation"), Observation, tap=True)
+        self.counters: dict[str, int] = {}
+        node.on(keys.delivered("control"), Control, "link.control", self._move)
+
+    def _move(self, packet: Control, arrays: dict[str, NDArray[Any]]) -> None:
+        lane, lanes, step = packet.lane, packet.lanes, packet.step + 1
+        applied = mask_of(arrays["mask"])
+        with np.errstate(over="ignore", invalid="ignore"):
+            x, y = self._plants[lane].move(arrays.get("u"), applied)
+        if not (all_finite(x.ravel()) and all_finite(y.ravel())):
+            raise RunFailed(f"the state left the range of floating-point numbers at step {step}")
+        nu = bits(applied)
+        self._ack(step, lane, lanes, {"nu": nu})
+        self._truth(step, lane, lanes, {"x": x, "nu": nu})
+        self._observe(step, lane, lanes, {"y": y})

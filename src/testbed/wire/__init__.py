@@ -1,0 +1,1 @@
+"""Messages, codec, keys, and the bus that carries them."""

@@ -1,0 +1,59 @@
+"""Key expressions: the one place that knows them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+LinkName = Literal["control", "observation", "ack"]
+
+ROOT = "testbed"
+
+
+class Keys:
+    """The keys of one run: ``testbed/RUN/…``."""
+
+    def __init__(self, run: str) -> None:
+        self.prefix = f"{ROOT}/{run}"
+
+    @property
+    def clock(self) -> str:
+        return f"{self.prefix}/clock"
+
+    @property
+    def command(self) -> str:
+        return f"{self.prefix}/command"
+
+    @property
+    def truth(self) -> str:
+        return f"{self.prefix}/truth"
+
+    @property
+    def bounds(self) -> str:
+        return f"{self.prefix}/bounds"
+
+    @property
+    def scenario(self) -> str:
+        """Ask here for the run's resolved scenario."""
+        return f"{self.prefix}/scenario"
+
+    def sent(self, link: LinkName) -> str:
+        """Where the sender of a link publishes."""
+        return f"{self.prefix}/{link}/sent"
+
+    def delivered(self, link: LinkName) -> str:
+        """Where the link publishes what it delivers."""
+        return f"{self.prefix}/{link}/delivered"
+
+    def tap(self, key: str) -> str:
+        """Where the recorded lanes of what goes over ``key`` are copied to."""
+        return f"{self.prefix}/tap/{key[len(self.prefix) + 1 :]}"
+
+    def estimate(self, name: str) -> str:
+        return f"{self.prefix}/estimate/{name}"
+
+    def status(self, role: str) -> str:
+        return f"{self.prefix}/status/{role}"
+
+    def presence(self, role: str) -> str:
+        """Liveliness token of a role."""
+        return f"{self.prefix}/presence/{role}"

@@ -1,0 +1,190 @@
+"""Every message of a run. These pydantic models are the one source of the schemas and of what the codec accepts.
+
+A message is a JSON header, which is what the models describe, and the arrays that the header lists in ``arrays``.
+``ARRAYS`` says for each type which arrays there may be, with their shapes in the symbols of theory.md: ``lanes`` is the
+field of that name; n, p, q are the sizes of state, observation and input.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+PROTOCOL = 1
+
+RunId = Annotated[str, Field(pattern=r"^[a-z0-9]{8,32}$", description="Identifies the run; part of every key.")]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,63}$", description="Name of the role that sent it.")]
+Count = Annotated[int, Field(ge=0, le=2**63 - 1)]
+ArrayEntry = tuple[
+    Annotated[str, Field(description="name of the array")],
+    Annotated[Literal["<f8", "|u1"], Field(description="element type: little-endian float64, or one byte")],
+    Annotated[tuple[Count, ...], Field(description="shape, C order")],
+]
+
+
+class ArrayRule(BaseModel):
+    """What a message type allows of one array."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    dtype: Literal["<f8", "|u1"]
+    shape: tuple[str, ...]
+    required: bool
+    description: str
+
+
+def _floats(*shape: str, text: str, required: bool = True) -> ArrayRule:
+    return ArrayRule(dtype="<f8", shape=shape, required=required, description=text)
+
+
+def _bits(*shape: str, text: str, required: bool = True) -> ArrayRule:
+    return ArrayRule(dtype="|u1", shape=shape, required=required, description=text)
+
+
+class Message(BaseModel):
+    """What every message carries."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    ARRAYS: ClassVar[dict[str, ArrayRule]] = {}
+
+    v: Annotated[Literal[1], Field(description="version of the protocol")] = 1
+    type: str
+    run: RunId
+    source: Name
+    seq: Annotated[Count, Field(description="number of this message on its key, from 0, without gaps")]
+
+
+class Packet(Message):
+    """A message of the loop: one step of the lanes lane … lane + lanes − 1."""
+
+    step: Annotated[Count, Field(description="k; for a control packet the index of u_k")]
+    lane: Annotated[Count, Field(description="first lane of the packet")]
+    lanes: Annotated[int, Field(ge=1, le=2**31, description="number of lanes")]
+    arrays: tuple[ArrayEntry, ...] = ()
+
+
+_MASK = _bits(
+    "lanes", required=False, text="1 where the packet arrived in the lane; only behind a link; values elsewhere are 0"
+)
+
+
+class Control(Packet):
+    """u_k. Behind the link: with the arrival mask; without ``u`` if it arrived in no lane."""
+
+    type: Literal["control"] = "control"
+    ARRAYS: ClassVar[dict[str, ArrayRule]] = {
+        "u": _floats("lanes", "q", required=False, text="control input u_k"),
+        "mask": _MASK,
+    }
+
+
+class Observation(Packet):
+    """y_k. Behind the link: with the arrival mask (γ_k); without ``y`` if it arrived in no lane."""
+
+    type: Literal["observation"] = "observation"
+    ARRAYS: ClassVar[dict[str, ArrayRule]] = {
+        "y": _floats("lanes", "p", required=False, text="observation y_k"),
+        "mask": _MASK,
+    }
+
+
+class Acknowledgement(Packet):
+    """ν_{k−1}: whether control packet step − 1 reached the actuator."""
+
+    type: Literal["ack"] = "ack"
+    ARRAYS: ClassVar[dict[str, ArrayRule]] = {
+        "nu": _bits("lanes", required=False, text="ν_{k−1}, 1 where the control packet was applied"),
+        "mask": _MASK,
+    }
+
+
+class Truth(Packet):
+    """x_k and ν_{k−1}, for the collector only, never for an estimator."""
+
+    type: Literal["truth"] = "truth"
+    ARRAYS: ClassVar[dict[str, ArrayRule]] = {
+        "x": _floats("lanes", "n", text="state x_k"),
+        "nu": _bits("lanes", text="ν_{k−1}"),
+    }
+
+
+class EstimateMessage(Packet):
+    """x̂_k and P_k of one estimator, after the observation of step k."""
+
+    type: Literal["estimate"] = "estimate"
+    ARRAYS: ClassVar[dict[str, ArrayRule]] = {
+        "x_hat": _floats("lanes", "n", text="estimate of x_k"),
+        "P": _floats("lanes", "n", "n", text="its error covariance"),
+    }
+
+
+class BoundsMessage(Packet):
+    """Traces of the lower bound Pᴬ_k and the upper bound S_k."""
+
+    type: Literal["bounds"] = "bounds"
+    ARRAYS: ClassVar[dict[str, ArrayRule]] = {
+        "trace_lower": _floats("lanes", text="tr Pᴬ_k"),
+        "trace_upper": _floats("lanes", text="tr S_k; absent for an input without a bound", required=False),
+    }
+
+
+class ClockMessage(Message):
+    """Virtual time may advance until step ``step`` is complete."""
+
+    type: Literal["clock"] = "clock"
+    step: Count
+
+
+class Command(Message):
+    """An order to all roles. ``stop``: report your counters and leave."""
+
+    type: Literal["command"] = "command"
+    action: Literal["stop"]
+
+
+class Status(Message):
+    """A role's word to the orchestrator."""
+
+    type: Literal["status"] = "status"
+    state: Literal["failed", "stopped"]
+    detail: Annotated[str, Field(max_length=2000)] = ""
+    counters: dict[str, int] = {}
+    rejected: Annotated[dict[str, int], Field(description="refused messages by reason")] = {}
+
+
+MESSAGES: dict[str, type[Message]] = {
+    "control": Control,
+    "observation": Observation,
+    "ack": Acknowledgement,
+    "truth": Truth,
+    "estimate": EstimateMessage,
+    "bounds": BoundsMessage,
+    "clock": ClockMessage,
+    "command": Command,
+    "status": Status,
+}
+
+
+def messages_json_schema() -> dict[str, Any]:
+    """JSON Schema of every header, with ``x-arrays`` for what follows it."""
+    definitions: dict[str, Any] = {}
+    for name, model in MESSAGES.items():
+        schema = model.model_json_schema()
+        schema.pop("$defs", None)
+        if model.ARRAYS:
+            schema["x-arrays"] = {key: rule.model_dump() for key, rule in model.ARRAYS.items()}
+        definitions[name] = schema
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Messages of a testbed run",
+        "description": (
+            "A payload is: the four bytes 'NCS1'; the header's length in bytes as a little-endian uint32; the header, "
+            "JSON in UTF-8, padded with spaces to a multiple of 8; then the arrays in the order of the header's 'arrays' "
+            "(name, dtype, shape), C order, little-endian, each padded with zero bytes to a multiple of 8. "
+            "'x-arrays' says which arrays a type may have; 'lanes' there is the field, n, p, q are the sizes of the "
+            "state, the observation and the input."
+        ),
+        "oneOf": [{"$ref": f"#/$defs/{name}"} for name in definitions],
+        "$defs": definitions,
+    }

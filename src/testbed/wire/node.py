@@ -1,0 +1,113 @@
+"""A role's end of the bus: typed, numbered, checked."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+from numpy.typing import NDArray
+
+from testbed.wire.bus import Bus, Publish
+from testbed.wire.codec import Arrays, Decoder, PacketEncoder, Rejected, Sizes, encode
+from testbed.wire.keys import Keys
+from testbed.wire.messages import Command, Message, Packet, Status
+
+M = TypeVar("M", bound=Message)
+PacketHandler = Callable[[M, dict[str, NDArray[Any]]], None]
+
+ORCHESTRATOR = "orchestrator"
+
+
+class Send(Protocol):
+    """Publishes one packet."""
+
+    def __call__(self, step: int, lane: int, lanes: int, arrays: Arrays) -> None: ...
+
+
+class Node:
+    """What every role has: its name, the run's keys, checked subscriptions, and the count of what it refused.
+
+    tap: number of lanes (from lane 0) of which packets are copied for the recording; 0 for none.
+    """
+
+    def __init__(self, bus: Bus, run: str, name: str, sizes: Sizes, tap: int = 0) -> None:
+        self.bus, self.run, self.name, self.sizes = bus, run, name, sizes
+        self.keys = Keys(run)
+        self.rejected: Counter[str] = Counter()
+        self.stopped = False
+        self._tap = tap
+        self._status_seq = 0
+        self._status = bus.publisher(self.keys.status(name))
+        if name != ORCHESTRATOR:
+            self.on(self.keys.command, Command, ORCHESTRATOR, self._obey)
+
+    def sender(self, key: str, model: type[Packet], *, tap: bool = False) -> Send:
+        """A function that publishes packets of one type on one key, numbered; ``tap``: copy them for the recording."""
+        send = _numbered(self.bus.publisher(key), PacketEncoder(model, self.run, self.name))
+        if not tap or not self._tap or self._tap >= self.sizes.lanes:
+            return send
+        copy = _numbered(self.bus.publisher(self.keys.tap(key)), PacketEncoder(model, self.run, self.name))
+        recorded = self._tap
+
+        def send_both(step: int, lane: int, lanes: int, arrays: Arrays) -> None:
+            send(step, lane, lanes, arrays)
+            if lane < recorded:
+                kept = min(lanes, recorded - lane)
+                copy(step, lane, kept, {name: array[:kept] for name, array in arrays.items()})
+
+        return send_both
+
+    def on(self, key: str, model: type[M], source: str, handler: PacketHandler[M]) -> None:
+        """Call ``handler(header, arrays)`` for each valid message of ``source`` on ``key``; count the others."""
+        decoder = Decoder(model, self.run, self.sizes)
+        expected = 0
+
+        def receive(_: str, payload: bytes) -> None:
+            nonlocal expected
+            try:
+                header, arrays = decoder.decode(payload)
+                if header.source != source:
+                    raise Rejected("source", f"from {header.source}, expected {source}")
+                if header.seq != expected:
+                    raise Rejected("sequence", f"number {header.seq}, expected {expected}")
+            except Rejected as refusal:
+                self.rejected[refusal.reason] += 1
+                return
+            expected += 1
+            handler(header, arrays)
+
+        self.bus.subscribe(key, receive)
+
+    def announce(self) -> None:
+        """Say that this role is ready: all its subscriptions are declared."""
+        self.bus.announce(self.keys.presence(self.name))
+
+    def report(self, state: Any, counters: dict[str, int], detail: str = "") -> None:
+        """Tell the orchestrator how this role ended."""
+        status = Status(
+            run=self.run,
+            source=self.name,
+            seq=self._status_seq,
+            state=state,
+            detail=detail[:2000],
+            counters=counters,
+            rejected=dict(self.rejected),
+        )
+        self._status_seq += 1
+        self._status(encode(status))
+
+    def _obey(self, command: Command, _: dict[str, NDArray[Any]]) -> None:
+        if command.action == "stop":
+            self.stopped = True
+
+
+def _numbered(publish: Publish, encoder: PacketEncoder) -> Send:
+    seq = 0
+
+    def send(step: int, lane: int, lanes: int, arrays: Arrays) -> None:
+        nonlocal seq
+        publish(encoder.encode(seq, step, lane, lanes, arrays))
+        seq += 1
+
+    return send

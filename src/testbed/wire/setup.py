@@ -1,0 +1,75 @@
+"""What a role needs to know to join a run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+from testbed.scenario import FeedbackInput, Scenario, parse_scenario, to_toml
+from testbed.wire.codec import Sizes
+from testbed.wire.node import Node
+
+_WINDOW_MAX = 256
+_BYTES_IN_FLIGHT = 4_000_000
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One run: its identity and its scenario. All roles are given the same."""
+
+    run: str
+    scenario: Scenario
+
+    @cached_property
+    def sizes(self) -> Sizes:
+        s = self.scenario
+        return Sizes(n=s.system.n, p=s.system.p, q=s.system.q, lanes=s.lanes, steps=s.steps)
+
+    @cached_property
+    def blocks(self) -> tuple[tuple[int, int], ...]:
+        """(first lane, number of lanes) of each packet of a step."""
+        lanes, size = self.scenario.lanes, self.scenario.transport.lanes_per_packet or self.scenario.lanes
+        return tuple((lane, min(size, lanes - lane)) for lane in range(0, lanes, size))
+
+    @property
+    def closed_loop(self) -> bool:
+        return isinstance(self.scenario.input, FeedbackInput)
+
+    @property
+    def window(self) -> int:
+        """Steps in flight at most: 1 in a closed loop; else the scenario's, or as many as fit into a few megabytes."""
+        if self.closed_loop:
+            return 1
+        if self.scenario.clock.window is not None:
+            return self.scenario.clock.window
+        n, p, q = self.sizes.n, self.sizes.p, self.sizes.q
+        bytes_a_step = 8 * self.scenario.lanes * (2 * q + 2 * p + 2 * n + n * n)
+        return max(4, min(_WINDOW_MAX, _BYTES_IN_FLIGHT // bytes_a_step))
+
+    @property
+    def tap(self) -> int:
+        """Lanes whose packets are recorded."""
+        return {"none": 0, "first": 1, "all": self.scenario.lanes}[self.scenario.record]
+
+    def to_json(self) -> bytes:
+        return json.dumps({"run": self.run, "scenario": to_toml(self.scenario)}).encode()
+
+    @classmethod
+    def from_json(cls, payload: bytes) -> Setup:
+        data = json.loads(payload)
+        return cls(data["run"], parse_scenario(data["scenario"]))
+
+
+class Role(Protocol):
+    """A service of the loop. It subscribes in its constructor; the bus does the rest."""
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What it has to report at the end."""
+        ...
+
+
+Build = Callable[[Node, Setup], Role]

@@ -1,0 +1,98 @@
+"""The bus over Eclipse Zenoh, between processes."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from testbed.wire.bus import Answer, BusError, Handler, PresenceHandler, Publish
+
+INBOX_MAX = 65536
+"""Messages waiting in a process beyond which its receiving thread pauses, and zenoh holds back the senders."""
+
+
+class ZenohBus:
+    """Publishes reliably and blocking; hands every event to the thread that calls ``run``.
+
+    express: send each message at once instead of batching; right when only one is in flight.
+    """
+
+    def __init__(self, session: zenoh.Session, *, deadline_s: float = 10.0, express: bool = False) -> None:
+        self._session, self._deadline_s, self._express = session, deadline_s, express
+        self._inbox: queue.SimpleQueue[tuple[Callable[..., None], Any]] = queue.SimpleQueue()
+        self._declared: list[Any] = []
+
+    def run(self, timeout_s: float) -> bool:
+        """Handle what has arrived, waiting up to ``timeout_s`` for the first; False if nothing came."""
+        try:
+            handle, event = self._inbox.get(timeout=timeout_s)
+        except queue.Empty:
+            return False
+        handle(event)
+        for _ in range(min(self._inbox.qsize(), 1000)):
+            handle, event = self._inbox.get_nowait()
+            handle(event)
+        return True
+
+    def publisher(self, key: str) -> Publish:
+        publisher = self._session.declare_publisher(
+            key,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            reliability=zenoh.Reliability.RELIABLE,
+            express=self._express,
+        )
+        self._declared.append(publisher)
+        put: Publish = publisher.put
+        return put
+
+    def subscribe(self, key: str, handler: Handler) -> None:
+        def handle(sample: Any) -> None:
+            handler(str(sample.key_expr), sample.payload.to_bytes())
+
+        def handle_fixed(sample: Any) -> None:
+            handler(key, sample.payload.to_bytes())
+
+        one = handle if "*" in key else handle_fixed
+        self._declared.append(self._session.declare_subscriber(key, self._into_inbox(one)))
+
+    def ask(self, key: str, question: bytes = b"") -> bytes:
+        replies = self._session.get(key, payload=question, timeout=self._deadline_s)
+        for reply in replies:
+            if reply.ok is not None:
+                return bytes(reply.ok.payload.to_bytes())
+            raise BusError(f"{key}: {reply.err.payload.to_string() if reply.err else 'no answer'}")
+        raise BusError(f"no answer on {key} within {self._deadline_s:g} s")
+
+    def answer(self, key: str, answer: Answer) -> None:
+        def reply(query: Any) -> None:
+            with query:
+                query.reply(key, answer(query.payload.to_bytes() if query.payload is not None else b""))
+
+        self._declared.append(self._session.declare_queryable(key, self._into_inbox(reply)))
+
+    def announce(self, key: str) -> None:
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def watch(self, key: str, handler: PresenceHandler) -> None:
+        def handle(sample: Any) -> None:
+            handler(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        liveliness = self._session.liveliness()
+        self._declared.append(liveliness.declare_subscriber(key, self._into_inbox(handle), history=True))
+
+    def close(self) -> None:
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def _into_inbox(self, handle: Callable[..., None]) -> Any:
+        inbox = self._inbox
+
+        def put(event: Any) -> None:
+            while inbox.qsize() >= INBOX_MAX:
+                time.sleep(0.001)
+            inbox.put((handle, event))
+
+        return zenoh.handlers.Callback(put, indirect=False)
