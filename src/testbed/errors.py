@@ -25,9 +25,16 @@ class RunFailed(TestbedError):
 
 
 def nearest(word: str, allowed: Iterable[str]) -> str | None:
-    """The allowed word most like `word` (upper and lower case are the same), or None if none is like it."""
+    """The allowed word most like `word`, or the only one that begins with it; None if there is no such word.
+
+    Upper and lower case are the same.
+    """
+    lower = word.lower()
     by_lower = {candidate.lower(): candidate for candidate in allowed}
-    close = difflib.get_close_matches(word.lower(), by_lower, n=1, cutoff=0.6)
+    close = difflib.get_close_matches(lower, by_lower, n=1, cutoff=0.6)
+    if not close and len(lower) > 1:
+        longer = [candidate for candidate in by_lower if candidate.startswith(lower)]
+        close = longer if len(longer) == 1 else []
     return by_lower[close[0]] if close else None
 
 

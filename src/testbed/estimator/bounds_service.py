@@ -43,3 +43,11 @@ class BoundsService:
 
 def _lanes(component: Component, lanes: int) -> NDArray[np.float64]:
     return np.array(np.broadcast_to(component, (lanes,)))
+
+
+if __name__ == "__main__":
+    import sys
+
+    from testbed.wire.process import main
+
+    sys.exit(main(None, ROLE, BoundsService, "The bounds of the error covariance of a run."))

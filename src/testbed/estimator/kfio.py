@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.errors import UsageError
 from testbed.estimator.errors import MissingAck
 from testbed.estimator.model import Ack, Estimate, Model, newest_ack
 from testbed.estimator.riccati import Gain, phi, predict
@@ -21,6 +22,7 @@ from testbed.numerics.lanes import (
     vector_of,
     where_vector,
 )
+from testbed.scenario import ConstantInput, Input, NoLoss, Scenario
 
 
 class Kfio:
@@ -34,6 +36,16 @@ class Kfio:
         self._x, self._p = model.prior(lanes)
         self._k = 0
         self.counters: dict[str, int] = {}
+
+    def check_scenario(self, scenario: Scenario, acks: str, until: int) -> None:
+        """Raises UsageError where the scenario cannot give it every ν it needs."""
+        link = scenario.links.ack
+        complete = acks == "perfect" or (acks == "link" and isinstance(link.loss, NoLoss))
+        if not complete and not self._model.control.never_loses and self._model.q and not _zero(scenario.input):
+            raise UsageError(
+                f"kfio needs every ACK and gets {'none' if acks == 'none' else 'them over a lossy link'}; "
+                'allowed: acks = "perfect" here, [links.ack] mode = "perfect", or another estimator (aoe, ff, oe)'
+            )
 
     def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
         """Raises MissingAck where ν_{k−1} matters and is not known."""
@@ -64,3 +76,7 @@ class Kfio:
                 'give it acks = "perfect", or use aoe, ff or oe'
             )
         return nu
+
+
+def _zero(source: Input | None) -> bool:
+    return source is None or (isinstance(source, ConstantInput) and not any(source.value))

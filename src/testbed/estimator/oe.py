@@ -13,6 +13,7 @@ import numpy as np
 from annotated_types import Ge
 from numpy.typing import NDArray
 
+from testbed.errors import UsageError
 from testbed.estimator.errors import TooManyHistories
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.riccati import Gain, phi, predict
@@ -28,6 +29,7 @@ from testbed.numerics.lanes import (
     symmetric,
     vector_of,
 )
+from testbed.scenario import Scenario
 
 MAX_HISTORIES = 65536
 
@@ -64,6 +66,15 @@ class Oe:
         self._groups = [start]
         self._k = 0
         self.counters: dict[str, int] = {}
+
+    def check_scenario(self, scenario: Scenario, acks: str, until: int) -> None:
+        """Raises UsageError where the histories of the scenario pass the limit."""
+        longest = self._limit.bit_length() - 1
+        if acks == "none" and not self._model.control.never_loses and until > longest:
+            raise UsageError(
+                f"oe enumerates 2^k histories, that is 2^{until} at its last step, and the limit is max_histories = "
+                f"{self._limit}; allowed: until = {longest} or less, a larger max_histories, ACKs, or aoe"
+            )
 
     def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
         """Raises TooManyHistories where the number of hypotheses would pass the limit."""

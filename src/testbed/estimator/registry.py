@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from testbed.channel.chains import chain_of
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.model import Estimator, Model
-from testbed.scenario import Scenario
+from testbed.scenario import EstimatorSpec, Scenario
 
 _BUILT_IN = {
     "aoe": "testbed.estimator.aoe:Aoe",
@@ -41,6 +41,20 @@ def create(kind: str, model: Model, *, lanes: int, options: Mapping[str, Any] | 
     """
     factory = _factory(kind)
     return factory(model, lanes, **_checked(kind, factory, dict(options or {})))
+
+
+def check(spec: EstimatorSpec, model: Model, *, acks: str, scenario: Scenario) -> None:
+    """Raises UsageError where an estimator of a scenario cannot be made, or says that it cannot run in it.
+
+    For the latter its class may have ``check_scenario(scenario, acks, until)``, with the step at which it ends.
+    """
+    try:
+        estimator = create(spec.kind, model, lanes=1, options=spec.options)
+        own_check = getattr(estimator, "check_scenario", None)
+        if own_check is not None:
+            own_check(scenario, acks, spec.until or scenario.steps)
+    except UsageError as error:
+        raise UsageError(f"estimators.{spec.name}: {error}") from None
 
 
 def model_of(scenario: Scenario) -> Model:

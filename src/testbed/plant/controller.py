@@ -75,3 +75,11 @@ class Feedback:
             if k < self._granted:
                 del self._ready[lane]
                 self._send(k, lane, len(u), {"u": u})
+
+
+if __name__ == "__main__":
+    import sys
+
+    from testbed.wire.process import main
+
+    sys.exit(main(None, ROLE, build, "The controller of a run."))

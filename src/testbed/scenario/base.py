@@ -7,10 +7,12 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, WithJsonSchema
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 SHOWN_MAX = 60
+COUNT_MAX = 2**31 - 1
+"""Of steps, lanes and the like: far beyond what can run, and within every integer type."""
 
 
 class Part(BaseModel):
@@ -42,8 +44,16 @@ def shown(value: object) -> str:
         return "true" if value else "false"
     if isinstance(value, dict):
         return "a table"
-    text = repr(value)
+    try:
+        text = repr(list(value) if isinstance(value, tuple) else value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, lists within lists within …
+        return "a value too long to show"
     return text if len(text) <= SHOWN_MAX else text[: SHOWN_MAX - 2] + " …"
+
+
+def count(amount: int, noun: str) -> str:
+    """An amount with its noun: "1 row", "2 rows"."""
+    return f"{amount} {noun}" if amount == 1 else f"{amount} {noun}s"
 
 
 def number(value: object, at: str = "", allowed: str = "a finite number") -> float:
@@ -92,8 +102,8 @@ def to_matrix(value: object) -> tuple[tuple[float, ...], ...]:
     )
     for i, row in enumerate(result):
         if not row or len(row) != len(result[0]):
-            wanted = f"{len(result[0])} numbers, as in row 0" if result[0] else "at least one number"
-            raise problem(f"got {len(row)} numbers; allowed: {wanted}", f"[{i}]")
+            wanted = f"{count(len(result[0]), 'number')}, as in row 0" if result[0] else "at least one number"
+            raise problem(f"got {count(len(row), 'number')}; allowed: {wanted}", f"[{i}]")
     return result
 
 
@@ -122,12 +132,13 @@ def size(matrix: Sequence[Sequence[float]]) -> tuple[int, int]:
     return len(matrix), len(matrix[0])
 
 
-Vector = Annotated[tuple[float, ...], BeforeValidator(to_vector), Field(min_length=1)]
-Matrix = Annotated[tuple[tuple[float, ...], ...], BeforeValidator(to_matrix), Field(min_length=1)]
+Vector = Annotated[tuple[float, ...], Field(min_length=1), BeforeValidator(to_vector)]
+Matrix = Annotated[tuple[tuple[float, ...], ...], Field(min_length=1), BeforeValidator(to_matrix)]
+Count = Annotated[int, Field(ge=1, le=COUNT_MAX)]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 ScalarOrVector = Annotated[
     float | tuple[float, ...],
-    PlainValidator(to_scalar_or_vector),
+    BeforeValidator(to_scalar_or_vector),
     WithJsonSchema(
         {"anyOf": [{"type": "number"}, {"type": "array", "items": {"type": "number"}, "minItems": 1}]},
     ),

@@ -12,7 +12,7 @@ UNITS_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60
 DURATION_NS_MAX = 2**63 - 1
 
 _NUMBER = r"[0-9]{1,19}(?:\.[0-9]{1,19})?"
-_FORM = re.compile(rf"({_NUMBER})\s*([A-Za-zµ]+)", re.ASCII)
+_FORM = re.compile(rf"({_NUMBER})\s*([A-Za-z]+)", re.ASCII)
 _ALLOWED = f"a duration with a unit ({', '.join(UNITS_NS)}), such as '10 ms'"
 
 
@@ -41,5 +41,5 @@ def _canonical(value: object) -> str:
     return format_duration(parse_duration(value))
 
 
-Duration = Annotated[str, BeforeValidator(_canonical), Field(pattern=rf"^{_NUMBER}\s*({'|'.join(UNITS_NS)})$")]
+Duration = Annotated[str, Field(pattern=rf"^{_NUMBER}\s*({'|'.join(UNITS_NS)})$"), BeforeValidator(_canonical)]
 """A duration as canonical text; `parse_duration` gives its nanoseconds."""

@@ -3,9 +3,9 @@
 import math
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from testbed.scenario.base import Part, problem, sequence, shown
+from testbed.scenario.base import Count, Part, problem, sequence, shown
 
 NAME_PATTERN = r"^[a-z][a-z0-9_-]{0,31}$"
 NAME_ALLOWED = "1 to 32 of a-z, 0-9, _ and -, a letter first"
@@ -34,8 +34,8 @@ class EstimatorSpec(Part):
     acks: Literal["none", "perfect"] | None = Field(
         default=None, description="What it is told of the control packets; left out: that of [links.ack]."
     )
-    until: int | None = Field(
-        default=None, ge=1, description="The last step at which it runs, 1 … steps; left out: the last step of all."
+    until: Count | None = Field(
+        default=None, description="The last step at which it runs, 1 … steps; left out: the last step of all."
     )
     options: dict[str, Any] = Field(default_factory=dict, description="Every other key of its table.")
 
@@ -44,14 +44,20 @@ class EstimatorSpec(Part):
     def _gather_options(cls, data: Any) -> Any:
         if not isinstance(data, dict):
             return data
-        own = {key: value for key, value in data.items() if key in cls.model_fields}
-        own["options"] = {**data.get("options", {}), **{key: data[key] for key in data if key not in cls.model_fields}}
+        given = data.get("options", {})
+        if not isinstance(given, dict):
+            raise problem(
+                f"got {shown(given)}; allowed: a table, or its keys beside {', '.join(cls.reserved)}", "options"
+            )
+        for key in given:
+            if key in cls.model_fields:
+                raise problem(
+                    f"got the reserved key {key!r}; allowed: any key but {', '.join(cls.model_fields)}", "options"
+                )
+        own = {key: value for key, value in data.items() if key in cls.reserved}
+        rest = {key: value for key, value in data.items() if key not in cls.model_fields}
+        own["options"] = {key: _plain_value(value, key) for key, value in {**given, **rest}.items()}
         return own
-
-    @field_validator("options")
-    @classmethod
-    def _plain(cls, options: dict[str, Any]) -> dict[str, Any]:
-        return {key: _plain_value(value, key) for key, value in options.items()}
 
 
 def _plain_value(value: Any, at: str) -> Any:
@@ -61,6 +67,8 @@ def _plain_value(value: Any, at: str) -> Any:
     entries = sequence(value)
     if entries is not None:
         return [_plain_value(entry, f"{at}[{i}]") for i, entry in enumerate(entries)]
+    if isinstance(value, int) and not isinstance(value, bool) and not -(2**63) <= value < 2**63:
+        raise problem(f"got {shown(value)}; allowed: an integer of 64 bits", at)
     if isinstance(value, (bool, int, str)) or (isinstance(value, float) and math.isfinite(value)):
         return value
     raise problem(f"got {shown(value)}; allowed: true or false, a finite number, a text, a list or a table", at)

@@ -47,7 +47,7 @@ def explain(error: ValidationError) -> str:
     ]
     texts = [_unknown_key(place) for _, place in unknown] + [_wrong_value(entry, place) for entry, place in others]
     more = f" (and {len(texts) - 1} more)" if len(texts) > 1 else ""
-    return " ".join((texts[0] + more).split())
+    return texts[0] + more
 
 
 def _is_unknown(entry: ErrorDetails, place: Place) -> bool:
@@ -140,6 +140,16 @@ def _plain(annotation: Any) -> Any:
     return annotation
 
 
+def _nested_metadata(annotation: Any) -> list[Any]:
+    """The constraints that are annotated inside a union with `None`."""
+    entries: list[Any] = []
+    for member in get_args(annotation):
+        if get_origin(member) is Annotated:
+            for entry in get_args(member)[1:]:
+                entries.extend(entry.metadata if isinstance(entry, FieldInfo) else [entry])
+    return entries
+
+
 def allowed(place: Place) -> str:
     """What is allowed at a place, in words."""
     if place.field is None:
@@ -155,8 +165,9 @@ def allowed(place: Place) -> str:
 
 
 def _allowed_plain(plain: Any, field: FieldInfo) -> str:
-    low = next((entry.ge for entry in field.metadata if isinstance(entry, annotated_types.Ge)), None)
-    high = next((entry.le for entry in field.metadata if isinstance(entry, annotated_types.Le)), None)
+    metadata = [*field.metadata, *_nested_metadata(field.annotation)]
+    low = next((entry.ge for entry in metadata if isinstance(entry, annotated_types.Ge)), None)
+    high = next((entry.le for entry in metadata if isinstance(entry, annotated_types.Le)), None)
     limits = f"{low:g} … {high:g}" if plain is float else f"{low} … {high}"
     if low is not None and high is None:
         limits = f"{low} or more"
@@ -166,8 +177,12 @@ def _allowed_plain(plain: Any, field: FieldInfo) -> str:
         return "an integer" if low is None else f"an integer, {limits}"
     if plain is float:
         return "a finite number" if low is None else limits
-    if any(getattr(entry, "pattern", None) == NAME_PATTERN for entry in field.metadata):
+    if any(getattr(entry, "pattern", None) == NAME_PATTERN for entry in metadata):
         return NAME_ALLOWED
-    most = next((entry.max_length for entry in field.metadata if isinstance(entry, annotated_types.MaxLen)), None)
-    least = next((entry.min_length for entry in field.metadata if isinstance(entry, annotated_types.MinLen)), 0)
-    return f"a text of {least} to {most} characters" if most else "a text" + (" that is not empty" if least else "")
+    most = next((entry.max_length for entry in metadata if isinstance(entry, annotated_types.MaxLen)), None)
+    least = next((entry.min_length for entry in metadata if isinstance(entry, annotated_types.MinLen)), 0)
+    return (
+        f"a text of {least} to {most} characters, on one line"
+        if most
+        else "a text" + (" that is not empty" if least else "")
+    )

@@ -4,7 +4,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
-from testbed.scenario.base import Matrix, Part, ScalarOrVector, Vector, problem, sequence, shown
+from testbed.scenario.base import Matrix, Part, ScalarOrVector, Vector, count, problem, sequence, shown
 
 
 def _positive(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
@@ -104,8 +104,8 @@ def check_channels(source: Input, q: int) -> None:
         value = getattr(source, key)
         if key in ("values", "gain"):
             width = len(value[0]) if key == "values" else len(value)
-            unit = "numbers a row" if key == "values" else "rows"
+            unit = count(width, "number") + " a row" if key == "values" else count(width, "row")
             if width != q:
-                raise problem(f"got {width} {unit}; allowed: {q}, the number of columns of system.B", key)
+                raise problem(f"got {unit}; allowed: {q}, the number of columns of system.B", key)
         elif sequence(value) is not None and len(value) != q:
-            raise problem(f"got {len(value)} numbers; allowed: {q}, the number of columns of system.B", key)
+            raise problem(f"got {count(len(value), 'number')}; allowed: {q}, the number of columns of system.B", key)

@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from testbed.errors import UsageError
+from testbed.scenario.base import shown
 from testbed.scenario.explain import explain
 from testbed.scenario.models import Scenario
 from testbed.scenario.table import read_table, read_text
@@ -23,7 +24,7 @@ def load_scenario(path: Path | str) -> Scenario:
     try:
         text = read_text(Path(path))
     except UsageError as error:
-        raise UsageError(f"{path}: {error}") from None
+        raise _error(str(path), error) from None
     return parse_scenario(text, Path(path).parent, source=str(path))
 
 
@@ -38,18 +39,24 @@ def parse_scenario(
         tables = _parse_toml(dict_or_text) if isinstance(dict_or_text, str) else dict(dict_or_text)
         return Scenario.model_validate(_resolve_files(tables, Path(base_dir)))
     except ValidationError as error:
-        raise UsageError(f"{source}: {explain(error)}") from None
+        raise _error(source, explain(error)) from None
     except UsageError as error:
-        raise UsageError(f"{source}: {error}") from None
+        raise _error(source, error) from None
+    except RecursionError:
+        raise _error(source, "arrays or tables are nested too deeply") from None
+
+
+def _error(source: str, text: object) -> UsageError:
+    """The error as one line that can be printed, whatever names and keys are in it."""
+    line = " ".join(f"{source}: {text}".split())
+    return UsageError("".join(letter if letter.isprintable() else "?" for letter in line))
 
 
 def _parse_toml(text: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"not valid TOML: {' '.join(str(error).split())}") from None
-    except RecursionError:
-        raise UsageError("not valid TOML: arrays or tables are nested too deeply") from None
+    except ValueError as error:  # of the syntax, or an integer of thousands of digits
+        raise UsageError(f"not valid TOML: {error}") from None
 
 
 def _resolve_files(tables: dict[str, Any], base_dir: Path) -> dict[str, Any]:
@@ -80,7 +87,7 @@ def _read_input_table(source: dict[str, Any], base_dir: Path) -> dict[str, Any]:
         return source
     file = source["file"]
     if not isinstance(file, str) or not file:
-        raise UsageError(f"input.file: got {file!r}; allowed: the path of a CSV file")
+        raise UsageError(f"input.file: got {shown(file)}; allowed: the path of a CSV file")
     try:
         values = read_table(base_dir / file)
     except UsageError as error:

@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from testbed.errors import did_you_mean
-from testbed.scenario.base import Part, problem, shown, size
+from testbed.scenario.base import Count, Part, count, problem, shown, size
 from testbed.scenario.estimators import EstimatorSpec
 from testbed.scenario.inputs import ConstantInput, FeedbackInput, Input, TableInput, check_channels
 from testbed.scenario.links import Links
@@ -26,9 +26,15 @@ class Scenario(Part):
 
     later_keys: ClassVar[tuple[str, ...]] = ("uncertainty", "events")
 
-    name: str = Field(default="scenario", min_length=1, max_length=128, description="Name in the results.")
-    steps: int = Field(default=100, ge=1, description="Number of steps, k = 1 … steps.")
-    lanes: int = Field(default=1, ge=1, description="Number of independent realisations that run side by side.")
+    name: str = Field(
+        default="scenario",
+        min_length=1,
+        max_length=128,
+        pattern=r"^[^\x00-\x1f\x7f]+$",
+        description="Name in the results, on one line.",
+    )
+    steps: Count = Field(default=100, description="Number of steps, k = 1 … steps.")
+    lanes: Count = Field(default=1, description="Number of independent realisations that run side by side.")
     seed: int = Field(default=1, ge=0, le=SEED_MAX, description="Seed of every random draw.")
     record: Literal["first", "all", "none"] = Field(default="first", description="Which lanes the recording keeps.")
     bounds: bool = Field(default=True, description="Whether the bounds of the error covariance are computed.")
@@ -67,7 +73,9 @@ class Scenario(Part):
         check_channels(source, system.q)
         if isinstance(source, TableInput) and len(source.values) < info.data.get("steps", 0):
             steps = info.data["steps"]
-            raise problem(f"got {len(source.values)} rows; allowed: at least {steps}, one for each step", "values")
+            raise problem(
+                f"got {count(len(source.values), 'row')}; allowed: at least {steps}, one for each step", "values"
+            )
         if isinstance(source, FeedbackInput):
             return _closed_loop(source, system, info)
         return source

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from testbed.scenario.base import Matrix, Part, Vector, problem, size
+from testbed.scenario.base import Matrix, Part, Vector, count, problem, size
 from testbed.scenario.definite import check_symmetric
 
 
@@ -73,7 +73,7 @@ class System(Part):
         if matrix is not None and "A" in info.data:
             n, (rows, columns) = len(info.data["A"]), size(matrix)
             if rows != n:
-                raise problem(f"got {rows} × {columns}; allowed: {n} rows, as A is {n} × {n}")
+                raise problem(f"got {rows} × {columns}; allowed: {count(n, 'row')}, as A is {n} × {n}")
         return matrix
 
     @field_validator("C")
@@ -82,7 +82,7 @@ class System(Part):
         if "A" in info.data:
             n, (rows, columns) = len(info.data["A"]), size(C)
             if columns != n:
-                raise problem(f"got {rows} × {columns}; allowed: {n} columns, as A is {n} × {n}")
+                raise problem(f"got {rows} × {columns}; allowed: {count(n, 'column')}, as A is {n} × {n}")
         return C
 
     @field_validator("Q")
@@ -106,7 +106,7 @@ class System(Part):
     @classmethod
     def _check_x0_mean(cls, x0_mean: Vector, info: ValidationInfo) -> Vector:
         if "A" in info.data and len(x0_mean) != len(info.data["A"]):
-            raise problem(f"got {len(x0_mean)} numbers; allowed: {len(info.data['A'])}, the size of A")
+            raise problem(f"got {count(len(x0_mean), 'number')}; allowed: {len(info.data['A'])}, the size of A")
         return x0_mean
 
     @field_validator("P0")

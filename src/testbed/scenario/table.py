@@ -1,10 +1,10 @@
 """Reading text files and CSV tables of numbers."""
 
-import csv
 import math
 from pathlib import Path
 
 from testbed.errors import UsageError
+from testbed.scenario.base import count, shown
 
 
 def read_text(path: Path) -> str:
@@ -34,26 +34,27 @@ def read_table(path: Path) -> list[list[float]]:
     ]
     rows: list[list[float]] = []
     for index, (number, line) in enumerate(lines):
-        cells = [cell.strip() for cell in next(csv.reader([line]))]
-        values = [_finite(cell) for cell in cells]
+        cells = [cell.strip().strip('"') for cell in line.split(",")]
+        values = [_number(cell) for cell in cells]
         if index == 0 and all(value is None for value in values):
             continue
+        row: list[float] = []
         for cell, value in zip(cells, values, strict=True):
-            if value is None:
-                raise UsageError(f"line {number}: got {cell!r}; allowed: a finite number")
-        rows.append([value for value in values if value is not None])
+            if value is None or not math.isfinite(value):
+                raise UsageError(f"line {number}: got {shown(cell)}; allowed: a finite number")
+            row.append(value)
+        rows.append(row)
         if len(rows[-1]) != len(rows[0]):
             raise UsageError(
-                f"line {number}: got {len(rows[-1])} numbers; allowed: {len(rows[0])}, as in the first row"
+                f"line {number}: got {count(len(rows[-1]), 'number')}; allowed: {len(rows[0])}, as in the first row"
             )
     if not rows:
         raise UsageError("no rows; allowed: a row of numbers for each step")
     return rows
 
 
-def _finite(cell: str) -> float | None:
+def _number(cell: str) -> float | None:
     try:
-        value = float(cell)
+        return float(cell)
     except ValueError:
         return None
-    return value if math.isfinite(value) else None

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from testbed.scenario.base import Part, problem, shown
+from testbed.scenario.base import Count, Part, problem, shown
 from testbed.scenario.durations import Duration, parse_duration
 
 
@@ -16,8 +16,8 @@ class Clock(Part):
         default="virtual", description="virtual: simulated time, as fast as the processes can go."
     )
     period: Duration = Field(default="10 ms", description="Simulated time of one step, a duration such as '10 ms'.")
-    window: int | None = Field(
-        default=None, ge=1, description="Steps that may be in flight at once, 1 or more; left out: chosen by the run."
+    window: Count | None = Field(
+        default=None, description="Steps that may be in flight at once, 1 or more; left out: chosen by the run."
     )
 
     @field_validator("mode", mode="before")
@@ -76,8 +76,8 @@ class Transport(Part):
     deadline: Duration = Field(
         default="10 s", description="A run without progress for that long has failed; a duration such as '10 s'."
     )
-    lanes_per_packet: int | None = Field(
-        default=None, ge=1, description="The most lanes that one packet carries, 1 or more; left out: all of them."
+    lanes_per_packet: Count | None = Field(
+        default=None, description="The most lanes that one packet carries, 1 or more; left out: all of them."
     )
     tls: Tls | None = Field(default=None, description="Encryption; left out: none.")
     user: str | None = Field(default=None, min_length=1, description="User name of the processes.")

@@ -78,7 +78,12 @@ class PacketEncoder:
 
 
 def _joined(header: bytes, arrays: Arrays) -> bytes:
-    pieces: list[bytes | memoryview] = [MAGIC, (len(header) + -len(header) % 8).to_bytes(4, "little"), header, b" " * (-len(header) % 8)]
+    pieces: list[bytes | memoryview] = [
+        MAGIC,
+        (len(header) + -len(header) % 8).to_bytes(4, "little"),
+        header,
+        b" " * (-len(header) % 8),
+    ]
     for array in arrays.values():
         pieces.append(array.data if array.flags.c_contiguous and array.size else array.tobytes())
         if array.nbytes % 8:

@@ -22,7 +22,7 @@ class ZenohBus:
     """
 
     def __init__(self, session: zenoh.Session, *, deadline_s: float = 10.0, express: bool = False) -> None:
-        self._session, self._deadline_s, self._express = session, deadline_s, express
+        self._session, self._deadline_s, self.express = session, deadline_s, express
         self._inbox: queue.SimpleQueue[tuple[Callable[..., None], Any]] = queue.SimpleQueue()
         self._declared: list[Any] = []
 
@@ -43,7 +43,7 @@ class ZenohBus:
             key,
             congestion_control=zenoh.CongestionControl.BLOCK,
             reliability=zenoh.Reliability.RELIABLE,
-            express=self._express,
+            express=self.express,
         )
         self._declared.append(publisher)
         put: Publish = publisher.put

@@ -1,0 +1,28 @@
+"""Which moments of the error covariance are finite under Markov observation losses."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from testbed.channel.loss import Chain
+from testbed.numerics.lanes import Floats
+
+
+def spectral_radius(A: Floats) -> float:
+    """ρ(A), A (n, n)."""
+    return float(np.max(np.abs(np.linalg.eigvals(A))))
+
+
+def finite_moment_order(A: Floats, observation: Chain) -> float:
+    """The order r* up to which moments of the stationary error covariance can be finite: r < r* is necessary.
+
+    In a run of losses the covariance grows by ρ(A)² a step and the run goes on with probability 1 − recovery, so that
+    its r-th moment needs ρ^{2r} (1 − recovery) < 1 (P Corollary 9: necessary and sufficient for scalar systems).
+    Infinite for ρ ≤ 1 or where a loss is never followed by another.
+    """
+    rho, persistence = spectral_radius(A), 1.0 - observation.recovery
+    if rho <= 1.0 or persistence <= 0.0 or observation.never_loses:
+        return math.inf
+    return -math.log(persistence) / (2.0 * math.log(rho)) if persistence < 1.0 else 0.0

@@ -1,0 +1,1 @@
+"""The orchestrator: starts the roles, drives the clock, collects, reports."""

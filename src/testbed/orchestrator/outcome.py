@@ -1,0 +1,183 @@
+"""From what a run collected to its summary: figures, books, checks."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+
+import numpy as np
+
+from testbed import __version__
+from testbed.analysis.moments import finite_moment_order, spectral_radius
+from testbed.channel.chains import chain_of
+from testbed.estimator.service import acks_of, role_of
+from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.statistics import nees_band_95
+from testbed.orchestrator.summary import (
+    BoundFigures,
+    Check,
+    EstimatorFigures,
+    LinkFigures,
+    Summary,
+    Timing,
+    Transitions,
+)
+from testbed.plant.inputs import control_bound
+from testbed.scenario import Scenario
+from testbed.wire.messages import Status
+from testbed.wire.node import ORCHESTRATOR
+
+
+def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: Timing) -> Summary:
+    """The summary of a run that is over, whole or not."""
+    scenario, collector = conductor.setup.scenario, conductor.collector
+    links = {
+        role.removeprefix("link."): link_figures(report.counters)
+        for role, report in sorted(conductor.reports.items())
+        if role.startswith("link.") and report.counters
+    }
+    estimators = _estimators(conductor)
+    bounds = _bounds(conductor)
+    complete = status == "complete"
+    checks = [*moment_checks(scenario), *between_bounds(scenario, estimators, bounds)]
+    if complete:
+        checks += books(scenario, links, collector.applied)
+    rejected = {role: dict(r.rejected) for role, r in sorted(conductor.reports.items()) if r.rejected}
+    if conductor.node.rejected:
+        rejected[ORCHESTRATOR] = dict(conductor.node.rejected)
+    broken = next((check.text for check in checks if check.name == "books" and not check.ok), None)
+    return Summary.model_validate(
+        {
+            "name": scenario.name,
+            "seed": scenario.seed,
+            "steps": scenario.steps,
+            "lanes": scenario.lanes,
+            "completed_steps": collector.completed,
+            "status": "failed" if broken else status,
+            "reason": broken or reason,
+            "estimators": estimators,
+            "bounds": bounds,
+            "links": links,
+            "checks": checks,
+            "rejected": rejected,
+            "timing": timing,
+            "versions": versions(),
+        }
+    )
+
+
+def link_figures(counters: dict[str, int]) -> LinkFigures:
+    """A link's figures from the counters it reported."""
+    sent, dropped, bursts = counters["sent"], counters["dropped"], counters["bursts"]
+    return LinkFigures(
+        sent=sent,
+        delivered=counters["delivered"],
+        dropped=dropped,
+        transitions=Transitions.model_validate({key: counters[key] for key in ("00", "01", "10", "11")}),
+        loss_rate=dropped / sent if sent else None,
+        mean_burst=dropped / bursts if bursts else None,
+    )
+
+
+def moment_checks(scenario: Scenario) -> list[Check]:
+    """Whether the EEC and the variance of its sample mean can be finite."""
+    A, chain = np.array(scenario.system.A), chain_of(scenario.links.observation.loss)
+    order, rho = finite_moment_order(A, chain), spectral_radius(A)
+    where = f"ρ(A) = {rho:.6g}, P(arrival after a loss) = {chain.recovery:.6g}"
+    mean = f"ρ²(1 − recovery) = {rho**2 * (1 - chain.recovery):.4g}"
+    variance = f"ρ⁴(1 − recovery) = {rho**4 * (1 - chain.recovery):.4g}"
+    if order <= 1.0:
+        return [Check(name="finite mean", ok=False, text=f"{where}: {mean} ≥ 1, the EEC diverges")]
+    checks = [Check(name="finite mean", ok=True, text=f"{where}: {mean} < 1, necessary for a bounded EEC")]
+    if order <= 2.0:
+        text = (
+            f"{where}: {variance} ≥ 1, the error covariance has no finite variance in the long run (P Corollary 9): "
+            "standard errors and confidence bands of its mean are not to be trusted, more lanes do not mend that"
+        )
+        return [*checks, Check(name="finite variance", ok=False, text=text)]
+    return [*checks, Check(name="finite variance", ok=True, text=f"{where}: {variance} < 1")]
+
+
+def books(scenario: Scenario, links: dict[str, LinkFigures], applied: int) -> list[Check]:
+    """Every packet is accounted for: sent = delivered + dropped, and the plant applied what was delivered."""
+    total = scenario.lanes * scenario.steps
+    wrong = []
+    for name, link in links.items():
+        if link.sent != total:
+            wrong.append(f"link {name}: {link.sent} lane-packets sent, {total} expected")
+        if link.delivered + link.dropped + link.in_flight != link.sent:
+            wrong.append(f"link {name}: delivered and dropped do not add up to {link.sent}")
+    for name in ("control", "observation"):
+        if name not in links:
+            wrong.append(f"link {name} did not report")
+    if "control" in links and links["control"].delivered != applied:
+        wrong.append(f"link control delivered {links['control'].delivered}, the plant applied {applied}")
+    text = "; ".join(wrong) or f"{total} lane-packets a link: sent = delivered + dropped, delivered = applied"
+    return [Check(name="books", ok=not wrong, text=text)]
+
+
+def between_bounds(
+    scenario: Scenario, estimators: dict[str, EstimatorFigures], bounds: BoundFigures | None
+) -> list[Check]:
+    """Whether the mean of tr P lies between the means of the bounds, for the estimators of M Theorem 3."""
+    checks = []
+    for name, figures in estimators.items():
+        if bounds is None or figures.kind not in ("aoe", "oe"):
+            continue
+        steps = [k for k, mean in enumerate(figures.trace_P_mean) if mean is not None]
+        upper = bounds.upper_mean or (None,) * len(bounds.lower_mean)
+        inside = sum(
+            _at_most(bounds.lower_mean[k], figures.trace_P_mean[k]) and _at_most(figures.trace_P_mean[k], upper[k])
+            for k in steps
+        )
+        what = "between Pᴬ and S" if bounds.upper_mean is not None else "above Pᴬ"
+        text = f"mean tr P {what} at {inside} of {len(steps)} steps"
+        checks.append(Check(name=f"{name} within bounds", ok=inside == len(steps), text=text))
+    return checks
+
+
+def versions() -> dict[str, str]:
+    names = {"numpy": "numpy", "scipy": "scipy", "pydantic": "pydantic", "zenoh": "eclipse-zenoh"}
+    found = {name: version(distribution) for name, distribution in names.items()}
+    return {"testbed": __version__, "python": platform.python_version(), **found}
+
+
+def _at_most(a: float | None, b: float | None) -> bool:
+    return a is None or b is None or a <= b * (1 + 1e-9)
+
+
+def _estimators(conductor: Conductor) -> dict[str, EstimatorFigures]:
+    scenario = conductor.setup.scenario
+    out = {}
+    for spec in scenario.estimators:
+        series = conductor.collector.estimators[spec.name]
+        report = conductor.reports.get(role_of(spec.name), _SILENT)
+        figures = {f"{key}_mean": values for key, values in series.mean.items()}
+        figures |= {f"{key}_stderr": values for key, values in series.stderr.items()}
+        out[spec.name] = EstimatorFigures.model_validate(
+            {
+                "kind": spec.kind,
+                "acks": acks_of(scenario, spec),
+                "until": spec.until,
+                "nees_band_95": nees_band_95(scenario.system.n, scenario.lanes),
+                "undefined": series.undefined,
+                "counters": report.counters,
+                **figures,
+            }
+        )
+    return out
+
+
+def _bounds(conductor: Conductor) -> BoundFigures | None:
+    scenario, series = conductor.setup.scenario, conductor.collector.bounds
+    if not scenario.bounds:
+        return None
+    lower = {"lower_mean": series.mean["lower"], "lower_stderr": series.stderr["lower"]}
+    if control_bound(scenario) is None:
+        reason = "the control is feedback, for which no bound is known"
+        return BoundFigures.model_validate({**lower, "upper_reason": reason})
+    upper = {"upper_mean": series.mean["upper"], "upper_stderr": series.stderr["upper"]}
+    return BoundFigures.model_validate({**lower, **upper})
+
+
+_SILENT = Status(run="00000000", source="none", seq=0, state="stopped")

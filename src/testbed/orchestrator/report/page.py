@@ -1,0 +1,108 @@
+"""The page of the report: figures, tables and captions put into the template."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jinja2
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from testbed.orchestrator.report import csv_data, svg, text
+from testbed.orchestrator.report.derived import common_band, settled
+from testbed.orchestrator.report.figures import axes, covariance, excess, links, nees
+from testbed.orchestrator.report.link_model import Expected, expected_links
+from testbed.orchestrator.summary import Summary
+
+_ENVIRONMENT = jinja2.Environment(
+    loader=jinja2.PackageLoader("testbed.orchestrator.report"),
+    autoescape=True,
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_ENVIRONMENT.filters.update(number=text.number, count=text.count, share=text.share, band=text.band)
+_ENVIRONMENT.globals.update(plus_minus=text.plus_minus, plural=text.plural, steps_range=text.steps)
+
+
+@dataclass(frozen=True)
+class PageFigure:
+    """A figure as the template shows it: inline, and as two downloads."""
+
+    number: int
+    name: str
+    svg: Markup
+    svg_uri: str
+    csv_uri: str
+
+
+def report_html(summary: Summary, scenario_toml: str) -> str:
+    """The whole page; see `testbed.orchestrator.report.write_report`."""
+    expected = expected_links(summary, scenario_toml)
+    return _ENVIRONMENT.get_template("report.html").render(
+        summary=summary,
+        scenario_toml=scenario_toml,
+        drawn=_figures(summary, expected),
+        expected=expected,
+        settled={name: settled(figures, summary.completed_steps) for name, figures in summary.estimators.items()},
+        colours={name: svg.colour(index) for index, name in enumerate(summary.estimators)},
+        band=common_band(summary),
+        stride=axes.stride(summary.completed_steps),
+        dots=summary.completed_steps <= axes.DOTS_STEPS_MAX,
+        upper_leaves=summary.completed_steps > 0 and covariance.choose_scale(summary).upper_leaves,
+        robust=[name for name, figures in summary.estimators.items() if figures.kind.startswith("rse")],
+    )
+
+
+def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageFigure]:
+    """The figures that this run has something to show in, numbered in their order."""
+    ran = summary.completed_steps > 0
+    has_estimators = ran and bool(summary.estimators)
+    available: list[tuple[str, bool, Callable[[], Figure], Callable[[], str], str]] = [
+        (
+            "covariance",
+            has_estimators or (ran and summary.bounds is not None),
+            lambda: covariance.draw(summary),
+            lambda: csv_data.covariance_csv(summary),
+            "Expected error covariance along the steps",
+        ),
+        (
+            "nees",
+            has_estimators,
+            lambda: nees.draw(summary),
+            lambda: csv_data.nees_csv(summary),
+            "Normalised estimation error squared along the steps",
+        ),
+        (
+            "excess",
+            has_estimators,
+            lambda: excess.draw(summary),
+            lambda: csv_data.excess_csv(summary),
+            "Squared error less claimed covariance along the steps",
+        ),
+        (
+            "links",
+            any(link.sent for link in summary.links.values()),
+            lambda: links.draw(summary, expected),
+            lambda: csv_data.links_csv(summary, expected),
+            "Loss rate and mean burst of the links",
+        ),
+    ]
+    shown = [entry for entry in available if entry[1]]
+    return {
+        name: _page_figure(number, name, draw, numbers(), label)
+        for number, (name, _, draw, numbers, label) in enumerate(shown, start=1)
+    }
+
+
+def _page_figure(number: int, name: str, draw: Callable[[], Figure], numbers: str, label: str) -> PageFigure:
+    with svg.look():
+        document = svg.svg_text(draw())
+    return PageFigure(
+        number=number,
+        name=name,
+        svg=Markup(svg.inline_svg(document, prefix=f"figure-{name}", label=label)),
+        svg_uri=svg.data_uri(document, "image/svg+xml"),
+        csv_uri=svg.data_uri(numbers, "text/csv"),
+    )

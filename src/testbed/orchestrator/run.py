@@ -1,0 +1,224 @@
+"""A run from start to summary: over zenoh with a process a role, or on the in-process bus."""
+
+from __future__ import annotations
+
+import secrets
+import shlex
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
+from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.outcome import summarise
+from testbed.orchestrator.preflight import check_estimators, prepare_folder
+from testbed.orchestrator.recorder import Recorder
+from testbed.orchestrator.roles import RoleSpec, roles_of
+from testbed.orchestrator.statistics import Progress
+from testbed.orchestrator.summary import Summary, Timing, write_summary
+from testbed.orchestrator.supervise import Supervisor, command_of
+from testbed.scenario import Scenario, to_toml
+from testbed.wire.memory_bus import MemoryNetwork
+from testbed.wire.node import Node
+from testbed.wire.setup import Role, Setup
+
+_POLL_S = 0.1
+_LEAVE_S = 1.0
+
+
+def _no_progress(completed: int, steps: int) -> None:
+    pass
+
+
+def _silent(line: str) -> None:
+    pass
+
+
+class Run:
+    """One run of a scenario into a folder.
+
+    ``progress`` is called with (completed steps, steps), ``say`` with lines for the user.
+    """
+
+    def __init__(
+        self, scenario: Scenario, out: Path, *, progress: Progress = _no_progress, say: Callable[[str], None] = _silent
+    ) -> None:
+        """Raises UsageError where the scenario cannot run or the folder cannot be written, before anything starts."""
+        check_estimators(scenario)
+        prepare_folder(out)
+        self._out, self._progress, self._say = out, progress, say
+        self._setup = Setup(secrets.token_hex(6), scenario)
+        self._roles = roles_of(scenario)
+        self._begun_s = time.monotonic()
+        self._started_s: float | None = None
+        self._reported = 0
+
+    def over_zenoh(self, external: Sequence[str] = ()) -> Summary:
+        """Across real processes; ``external`` names the roles that somebody starts by hand.
+
+        Raises UsageError when the endpoint cannot be opened or an external role does not exist.
+        """
+        from testbed.wire.session import open_router
+        from testbed.wire.zenoh_bus import ZenohBus
+
+        names = [role.name for role in self._roles]
+        for name in external:
+            if name not in names:
+                raise UsageError(
+                    f"--external {name}: no such role; allowed: {', '.join(names)}{did_you_mean(name, names)}"
+                )
+        transport = self._setup.scenario.transport
+        session, endpoint = open_router(transport)
+        supervisor = Supervisor(self._out / "logs")
+        recorder = self._recorder()
+        try:
+            bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.window == 1)
+            conductor = self._conductor(bus, recorder)
+            interrupted = False
+            try:
+                for role in self._roles:
+                    if role.name in external:
+                        self._say(f"start {role.name} by hand: {shlex.join(self._by_hand(role, endpoint))}")
+                    else:
+                        supervisor.start(role, endpoint, self._setup.run, transport)
+                self._drive(conductor, bus, supervisor, patient=bool(external))
+            except KeyboardInterrupt:
+                interrupted = True
+            self._settle(conductor, bus)
+            return self._finish(conductor, interrupted=interrupted)
+        finally:
+            supervisor.close(0.0 if self._failed else _LEAVE_S)
+            if recorder is not None:
+                recorder.close()
+            session.close()  # type: ignore[no-untyped-call]
+
+    def in_process(self, schedule: int | None = None) -> Summary:
+        """On the in-process bus; ``schedule`` seeds the order in which messages to different roles are delivered."""
+        network = MemoryNetwork(schedule)
+        recorder = self._recorder()
+        conductor = self._conductor(network.bus(), recorder)
+        interrupted = False
+        try:
+            nodes: list[tuple[Node, Role]] = []
+            for spec in self._roles:
+                node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.tap)
+                nodes.append((node, spec.build(node, self._setup)))
+                node.announce()
+            while not conductor.over:
+                if not network.step():
+                    conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
+                self._tell(conductor)
+        except KeyboardInterrupt:
+            interrupted = True
+        except TestbedError as error:
+            conductor.fail(str(error))
+        try:
+            conductor.stop()
+            network.run(lambda: all(node.stopped for node, _ in nodes))
+            for node, role in nodes:
+                node.report("stopped", role.counters)
+            network.run(lambda: conductor.all_reported)
+            return self._finish(conductor, interrupted=interrupted)
+        finally:
+            if recorder is not None:
+                recorder.close()
+
+    _failed = False
+
+    def _conductor(self, bus: object, recorder: Recorder | None) -> Conductor:
+        conductor = Conductor(bus, self._setup, [role.name for role in self._roles], recorder)  # type: ignore[arg-type]
+        conductor.on_started = self._mark_start
+        return conductor
+
+    def _mark_start(self) -> None:
+        self._started_s = time.monotonic()
+
+    def _recorder(self) -> Recorder | None:
+        scenario, path = self._setup.scenario, self._out / "recording.mcap"
+        if scenario.record == "none":
+            path.unlink(missing_ok=True)
+            return None
+        metadata = {"name": scenario.name, "scenario": to_toml(scenario)}
+        return Recorder(path, lanes=self._setup.tap, period_ns=scenario.clock.period_ns, metadata=metadata)
+
+    def _by_hand(self, role: RoleSpec, endpoint: str) -> list[str]:
+        return command_of(role, endpoint, self._setup.run, self._setup.scenario.transport)
+
+    def _drive(self, conductor: Conductor, bus: object, supervisor: Supervisor, *, patient: bool) -> None:
+        """Until the run is over, has failed, or made no progress for the deadline."""
+        deadline_s = self._setup.scenario.transport.deadline_ns / 1e9
+        last, since = -1, time.monotonic()
+        while not conductor.over:
+            bus.run(_POLL_S)  # type: ignore[attr-defined]
+            self._tell(conductor)
+            for role, ending in supervisor.dead().items():
+                if role not in conductor.reports:
+                    conductor.fail(f"{role} ended: {ending}{_last_words(supervisor.log_of(role))}")
+            if conductor.activity != last:
+                last, since = conductor.activity, time.monotonic()
+            elif time.monotonic() - since > deadline_s and not (patient and not conductor.started):
+                conductor.fail(f"no progress for {deadline_s:g} s; waiting for {conductor.awaiting()}")
+        if conductor.failure is not None and conductor.failure.endswith(" is gone"):
+            role = conductor.failure.removesuffix(" is gone")
+            ending = supervisor.ending_of(role)
+            if ending is not None:
+                conductor.failure = f"{role} ended: {ending}{_last_words(supervisor.log_of(role))}"
+
+    def _settle(self, conductor: Conductor, bus: object) -> None:
+        """Stop the roles and hear their last words."""
+        conductor.stop()
+        deadline = time.monotonic() + (5.0 if conductor.collector.finished else 0.5)
+        while not conductor.all_reported and time.monotonic() < deadline:
+            bus.run(0.02)  # type: ignore[attr-defined]
+
+    def _tell(self, conductor: Conductor) -> None:
+        completed = conductor.collector.completed
+        if completed != self._reported:
+            self._reported = completed
+            self._progress(completed, self._setup.scenario.steps)
+
+    def _finish(self, conductor: Conductor, *, interrupted: bool) -> Summary:
+        now = time.monotonic()
+        begun = self._started_s if self._started_s is not None else now
+        wall = now - begun
+        completed, lanes = conductor.collector.completed, self._setup.scenario.lanes
+        timing = Timing(
+            wall_s=wall,
+            startup_s=begun - self._begun_s,
+            steps_per_s=completed / wall if wall > 0 else None,
+            lane_steps_per_s=completed * lanes / wall if wall > 0 else None,
+            window=self._setup.window,
+        )
+        reason: str | None
+        if interrupted and not conductor.collector.finished:
+            status, reason = "interrupted", "interrupted by the user"
+        elif conductor.failure is not None:
+            status, reason = "failed", conductor.failure
+        else:
+            status, reason = "complete", None
+        summary = summarise(conductor, status=status, reason=reason, timing=timing)
+        self._failed = summary.status != "complete"
+        write_results(self._out, summary, self._setup.scenario)
+        return summary
+
+
+def write_results(out: Path, summary: Summary, scenario: Scenario) -> None:
+    """scenario.toml, summary.json and report.html. Raises RunFailed where the disk refuses."""
+    from testbed.orchestrator.report import write_report
+
+    toml = to_toml(scenario)
+    try:
+        (out / "scenario.toml").write_text(toml)
+        write_summary(out / "summary.json", summary)
+        write_report(out / "report.html", summary, toml)
+    except OSError as error:
+        raise RunFailed(f"cannot write the results into {out}: {error.strerror}") from None
+
+
+def _last_words(log: Path) -> str:
+    """The last line of a role's log, for an error text."""
+    try:
+        lines = log.read_text(errors="replace").strip().splitlines()
+    except OSError:
+        return ""
+    return f" ({lines[-1][:200]})" if lines else ""

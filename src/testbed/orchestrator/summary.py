@@ -1,0 +1,194 @@
+"""The contract of `summary.json`: the figures of one run.
+
+A figure that does not exist is null: a standard error with one lane, an estimator's steps after its `until`, a value
+that is not finite. Not a number and infinity become null when a model is built: what is written reads back as equal.
+Every list along k has one entry for each completed step, k = 1 first.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, NonNegativeInt, model_validator
+
+Z_95 = 1.96
+"""Half-width of a 95 % interval in standard errors, wherever a figure shows one."""
+
+
+def _finite(value: object) -> object:
+    return None if isinstance(value, float | np.floating) and not math.isfinite(value) else value
+
+
+def _finite_series(values: object) -> object:
+    if isinstance(values, np.ndarray):
+        values = values.tolist()
+    return [_finite(value) for value in values] if isinstance(values, list | tuple) else values
+
+
+Number = Annotated[float | None, BeforeValidator(_finite)]
+Series = Annotated[tuple[float | None, ...], BeforeValidator(_finite_series)]
+"""One entry a completed step; NumPy vectors are taken too."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class EstimatorFigures(_Model):
+    """Figures of one estimator; means and standard errors are over lanes."""
+
+    kind: str
+    acks: Literal["none", "perfect", "link"]
+    until: NonNegativeInt | None = Field(
+        default=None, description="last step at which it runs; null: the last of the run"
+    )
+    trace_P_mean: Series = Field(description="tr P_k")
+    trace_P_stderr: Series
+    squared_error_mean: Series = Field(description="‖x_k − x̂_k‖²")
+    squared_error_stderr: Series
+    nees_mean: Series = Field(description="(x − x̂)' P⁻¹ (x − x̂)")
+    nees_stderr: Series
+    excess_mean: Series = Field(
+        description="‖x − x̂‖² − tr P, paired by lane: zero in expectation for an exact estimator"
+    )
+    excess_stderr: Series
+    nees_band_95: tuple[FiniteFloat, FiniteFloat] = Field(
+        description="of nees_mean, from chi-square with n·lanes degrees"
+    )
+    undefined: NonNegativeInt = Field(default=0, description="lane-steps whose NEES is not defined")
+    counters: dict[str, NonNegativeInt] = Field(default_factory=dict)
+
+
+class BoundFigures(_Model):
+    """Bounds of tr E[P_k]: below by the ACK covariance, above by S (theory, sections 2 and 3.6)."""
+
+    lower_mean: Series
+    lower_stderr: Series
+    upper_mean: Series | None = None
+    upper_stderr: Series | None = None
+    upper_reason: str | None = Field(default=None, description="why there is no upper bound")
+
+
+class Transitions(_Model):
+    """Pairs of neighbouring packets of one lane: 0 lost, 1 delivered. In JSON the keys are 00, 01, 10, 11."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    lost_lost: NonNegativeInt = Field(default=0, alias="00")
+    lost_delivered: NonNegativeInt = Field(default=0, alias="01")
+    delivered_lost: NonNegativeInt = Field(default=0, alias="10")
+    delivered_delivered: NonNegativeInt = Field(default=0, alias="11")
+
+
+class LinkFigures(_Model):
+    """What one link did, counted over lane-packets."""
+
+    sent: NonNegativeInt
+    delivered: NonNegativeInt
+    dropped: NonNegativeInt
+    duplicated: NonNegativeInt = 0
+    late: NonNegativeInt = 0
+    in_flight: NonNegativeInt = 0
+    transitions: Transitions = Transitions()
+    loss_rate: Number = None
+    mean_burst: Number = Field(default=None, description="mean number of packets lost in a row")
+
+
+class Check(_Model):
+    """One statement about the run that was checked."""
+
+    name: str
+    ok: bool
+    text: str
+
+
+class Timing(_Model):
+    """How long the run took; seconds on the wall clock."""
+
+    wall_s: Number = None
+    startup_s: Number = None
+    steps_per_s: Number = None
+    lane_steps_per_s: Number = None
+    window: NonNegativeInt | None = None
+
+
+class Summary(_Model):
+    """`summary.json`."""
+
+    version: Literal[1] = 1
+    name: str
+    seed: NonNegativeInt
+    steps: NonNegativeInt
+    lanes: NonNegativeInt
+    completed_steps: NonNegativeInt
+    status: Literal["complete", "failed", "interrupted"]
+    reason: str | None = None
+    estimators: dict[str, EstimatorFigures]
+    bounds: BoundFigures | None = None
+    links: dict[str, LinkFigures]
+    checks: tuple[Check, ...] = ()
+    rejected: dict[str, dict[str, NonNegativeInt]] = Field(
+        default_factory=dict, description="messages refused, by role and reason"
+    )
+    timing: Timing = Timing()
+    versions: dict[str, str] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _lengths(self) -> Summary:
+        for where, series in self._series():
+            if len(series) != self.completed_steps:
+                raise ValueError(f"{where} has {len(series)} entries for {self.completed_steps} completed steps")
+        return self
+
+    def _series(self) -> Iterator[tuple[str, tuple[float | None, ...]]]:
+        parts: dict[str, BaseModel] = {f"estimators.{name}": figures for name, figures in self.estimators.items()}
+        if self.bounds is not None:
+            parts["bounds"] = self.bounds
+        for where, part in parts.items():
+            for field, value in part:
+                if field.endswith(("_mean", "_stderr")) and value is not None:
+                    yield f"{where}.{field}", value
+
+
+def write_summary(path: Path, summary: Summary) -> None:
+    """Write `summary` as JSON; floats keep all their digits. The file appears whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    text = _pretty(summary.model_dump(mode="json", by_alias=True)) + "\n"
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, path)
+
+
+def read_summary(path: Path) -> Summary:
+    """Read what `write_summary` wrote.
+
+    Raises:
+        OSError: the file cannot be read.
+        pydantic.ValidationError: it is not a summary (a ValueError that names each place).
+    """
+    return Summary.model_validate_json(path.read_bytes())
+
+
+def summary_json_schema() -> dict[str, Any]:
+    """JSON Schema of `summary.json`."""
+    return Summary.model_json_schema(mode="serialization", by_alias=True)
+
+
+def _pretty(value: object, indent: str = "") -> str:
+    """JSON with one line for each key; a list of numbers is one line."""
+    inner = indent + "  "
+    if isinstance(value, dict) and value:
+        lines = [f"{inner}{json.dumps(key, ensure_ascii=False)}: {_pretty(item, inner)}" for key, item in value.items()]
+        return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
+    if isinstance(value, list) and any(isinstance(item, dict) for item in value):
+        return "[\n" + ",\n".join(inner + _pretty(item, inner) for item in value) + f"\n{indent}]"
+    return json.dumps(value, allow_nan=False, ensure_ascii=False)

@@ -1,0 +1,95 @@
+"""A role as a process of its own: join the run, serve, report, leave."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import threading
+import traceback
+from collections.abc import Sequence
+
+from pydantic import ValidationError
+
+from testbed.errors import TestbedError
+from testbed.scenario import Transport
+from testbed.wire.bus import BusError
+from testbed.wire.keys import Keys
+from testbed.wire.node import ORCHESTRATOR, Node
+from testbed.wire.session import open_client
+from testbed.wire.setup import Build, Role, Setup
+from testbed.wire.zenoh_bus import ZenohBus
+
+_POLL_S = 1.0
+
+
+def parser(description: str) -> argparse.ArgumentParser:
+    """The options that every role's process has."""
+    out = argparse.ArgumentParser(description=description)
+    out.add_argument(
+        "--connect", required=True, metavar="ENDPOINT", help="where the run listens, e.g. tcp/127.0.0.1:7447"
+    )
+    out.add_argument("--run", required=True, metavar="RUN", help="identity of the run, as `testbed run` prints it")
+    out.add_argument("--transport", default="{}", metavar="JSON", help="[transport] of the scenario, where it has one")
+    out.add_argument("--supervised", action="store_true", help="leave when standard input closes")
+    return out
+
+
+def serve(options: argparse.Namespace, name: str, build: Build) -> int:
+    """Run one role until the orchestrator stops it or goes away. Returns the exit code."""
+    if options.supervised:
+        threading.Thread(target=_leave_with_parent, daemon=True).start()
+    try:
+        transport = Transport.model_validate(json.loads(options.transport))
+    except (ValidationError, ValueError) as error:
+        return _refuse(f"--transport: {error}")
+    try:
+        session = open_client(transport, options.connect)
+    except TestbedError as error:
+        return _refuse(str(error))
+    with session:
+        return _serve(ZenohBus(session, deadline_s=transport.deadline_ns / 1e9), options.run, name, build)
+
+
+def _serve(bus: ZenohBus, run: str, name: str, build: Build) -> int:
+    orphaned = threading.Event()
+    try:
+        setup = Setup.from_json(bus.ask(Keys(run).scenario))
+    except BusError as error:
+        return _refuse(str(error))
+    bus.express = setup.window == 1
+    node = Node(bus, run, name, setup.sizes, setup.tap)
+    role: Role | None = None
+    try:
+        role = build(node, setup)
+        bus.watch(node.keys.presence(ORCHESTRATOR), lambda _, alive: None if alive else orphaned.set())
+        node.announce()
+        while not node.stopped and not orphaned.is_set():
+            bus.run(_POLL_S)
+    except Exception as error:
+        text = str(error) if isinstance(error, TestbedError) else f"{type(error).__name__}: {error}"
+        traceback.print_exc()
+        node.report("failed", {} if role is None else role.counters, text)
+        return 1
+    if orphaned.is_set():
+        return _refuse(f"{name}: the orchestrator is gone")
+    node.report("stopped", role.counters)
+    return 0
+
+
+def _refuse(text: str) -> int:
+    print(text, file=sys.stderr)
+    return 2
+
+
+def _leave_with_parent() -> None:
+    """End this process when the supervisor's end of our standard input closes, however it died."""
+    while os.read(0, 4096):
+        pass
+    os._exit(3)
+
+
+def main(arguments: Sequence[str] | None, name: str, build: Build, description: str) -> int:
+    """The whole of a role's ``__main__`` that has no options of its own."""
+    return serve(parser(description).parse_args(arguments), name, build)
