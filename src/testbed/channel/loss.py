@@ -68,15 +68,15 @@ class LossProcess:
     """Draws the fate of packet 0, 1, 2, … for a block of lanes."""
 
     def __init__(self, chain: Chain, stream: Stream, lanes: int) -> None:
-        self._chain, self._stream, self._lanes = chain, stream, lanes
+        self.chain, self._stream, self._lanes = chain, stream, lanes
         self._last: Mask | None = None
 
     def next(self, number: int) -> Mask:
         """Arrival mask of packet ``number``: a ``bool`` for one lane, else a boolean array of shape (M,)."""
-        if self._chain.never_loses:
+        if self.chain.never_loses:
             return True if self._lanes == 1 else np.ones(self._lanes, dtype=np.bool_)
         (uniform,) = self._stream.uniforms(number)
-        self._last = uniform < self._chain.arrival_given(self._last)
+        self._last = uniform < self.chain.arrival_given(self._last)
         return self._last
 
 

@@ -189,9 +189,9 @@ class Run:
             lane_steps_per_s=completed * lanes / wall if wall > 0 else None,
             window=self._setup.window,
         )
-        reason: str | None
         if interrupted and not conductor.collector.finished:
-            status, reason = "interrupted", "interrupted by the user"
+            status = "interrupted"
+            reason: str | None = "interrupted by the user"
         elif conductor.failure is not None:
             status, reason = "failed", conductor.failure
         else:

@@ -15,7 +15,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, NonNegativeInt, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    ValidationError,
+    model_validator,
+)
+
+from testbed.errors import UsageError
 
 Z_95 = 1.96
 """Half-width of a 95 % interval in standard errors, wherever a figure shows one."""
@@ -173,9 +184,14 @@ def read_summary(path: Path) -> Summary:
 
     Raises:
         OSError: the file cannot be read.
-        pydantic.ValidationError: it is not a summary (a ValueError that names each place).
+        UsageError: it is not a summary.
     """
-    return Summary.model_validate_json(path.read_bytes())
+    try:
+        return Summary.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))
+        raise UsageError(f"{path}: not a summary: {place + ': ' if place else ''}{first['msg']}") from None
 
 
 def summary_json_schema() -> dict[str, Any]:

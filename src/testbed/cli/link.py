@@ -1,0 +1,69 @@
+"""``testbed link …``."""
+
+from __future__ import annotations
+
+import json as json_format
+from pathlib import Path
+from typing import Annotated, cast, get_args
+
+import typer
+
+from testbed.errors import UsageError, did_you_mean
+from testbed.wire.keys import LinkName
+
+app = typer.Typer(help="Look at one link of a scenario.", no_args_is_help=True, rich_markup_mode=None)
+
+
+@app.callback()
+def _group() -> None:
+    pass
+
+
+@app.command()
+def sample(
+    scenario: Annotated[Path, typer.Argument(metavar="SCENARIO.toml", help="The scenario.")],
+    name: Annotated[str, typer.Option("--link", metavar="LINK", help="control, observation or ack.")],
+    number: Annotated[int, typer.Option("-n", min=1, metavar="N", help="Number of packets.")],
+    out: Annotated[Path, typer.Option(metavar="TRACE.csv", help="File for the trace.")],
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed; default that of the scenario.")] = None,
+    lane: Annotated[int, typer.Option(min=0, help="Lane whose packets are sampled.")] = 0,
+    json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+) -> None:
+    """Send N packets over a link in simulated time and write what became of each.
+
+    TRACE.csv has the columns seq, sent_ns, delivered_ns, the last empty for a lost packet. With the seed of a run the
+    packets meet the same fate as in that run.
+    """
+    from testbed.channel.trace import sample_trace, write_trace
+    from testbed.scenario import load_scenario
+
+    loaded = load_scenario(scenario)
+    link = _link(name)
+    if link == "ack" and loaded.links.ack.mode == "none":
+        raise UsageError('--link ack: the scenario has none; allowed: with [links.ack] mode = "perfect" or "link"')
+    trace = sample_trace(loaded, link, number, seed=loaded.seed if seed is None else seed, lane=lane)
+    try:
+        write_trace(out, trace)
+    except OSError as error:
+        raise UsageError(f"cannot write {out}: {(error.strerror or str(error)).lower()}") from None
+    figures = trace.figures()
+    if json:
+        typer.echo(json_format.dumps(figures))
+        return
+    expected = figures["expected_loss_rate"]
+    typer.echo(
+        f"{link}: {figures['sent']} sent, {figures['dropped']} lost, loss rate {figures['loss_rate']:.6g} "
+        f"(expected {expected:.6g}), mean burst {_shown(figures['mean_burst'])} "
+        f"(expected {_shown(figures['expected_mean_burst'])}); {out}"
+    )
+
+
+def _link(name: str) -> LinkName:
+    names = get_args(LinkName)
+    if name not in names:
+        raise UsageError(f"--link {name}: no such link; allowed: {', '.join(names)}{did_you_mean(name, names)}")
+    return cast(LinkName, name)
+
+
+def _shown(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"

@@ -1,0 +1,42 @@
+"""The live display of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+
+@dataclass
+class Display:
+    """Where a run tells how far it is."""
+
+    progress: Progress
+    task: TaskID
+
+    def update(self, completed: int, steps: int) -> None:
+        self.progress.update(self.task, completed=completed, total=steps, rate=self._rate())
+
+    def say(self, line: str) -> None:
+        self.progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def _rate(self) -> str:
+        speed = self.progress.tasks[self.task].speed
+        return f"{speed:,.0f} steps/s" if speed else ""
+
+
+@contextmanager
+def progress_display(console: Console, name: str, steps: int, *, shown: bool) -> Iterator[Display]:
+    """A bar with the steps completed and their rate, on a terminal; nothing elsewhere."""
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, disable=not shown or not console.is_terminal) as progress:
+        yield Display(progress, progress.add_task(name, total=steps, rate="starting"))

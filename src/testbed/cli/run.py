@@ -1,0 +1,61 @@
+"""``testbed run``."""
+
+from __future__ import annotations
+
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+EXIT_CODES = {"complete": 0, "failed": 1, "interrupted": 130}
+
+
+def run(
+    scenario: Annotated[Path, typer.Argument(metavar="SCENARIO.toml", help="The scenario.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for the results; default runs/NAME-TIME.")
+    ] = None,
+    in_process: Annotated[
+        bool, typer.Option("--in-process", help="Everything in this process, without zenoh; the same figures.")
+    ] = False,
+    external: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ROLE", help="A role that you start by hand; the run prints how, and waits for it."),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print summary.json instead of tables.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress display.")] = False,
+) -> None:
+    """Run a scenario across real processes and report its expected error covariance.
+
+    Exit code 0: complete; 1: failed, with what was collected kept; 2: wrong input; 130: interrupted.
+    """
+    from rich.console import Console
+
+    from testbed.cli.progress import progress_display
+    from testbed.errors import UsageError
+    from testbed.orchestrator.run import Run
+    from testbed.orchestrator.table import end_table
+    from testbed.scenario import load_scenario
+
+    if in_process and external:
+        raise UsageError("--external needs processes; allowed: without --in-process")
+    loaded = load_scenario(scenario)
+    if out is None:
+        out = Path("runs") / f"{_file_name(loaded.name)}-{datetime.now():%Y%m%d-%H%M%S}"
+    console = Console(stderr=True)
+    with progress_display(console, loaded.name, loaded.steps, shown=not quiet) as display:
+        work = Run(loaded, out, progress=display.update, say=display.say)
+        summary = work.in_process() if in_process else work.over_zenoh(external or ())
+    if json:
+        sys.stdout.write((out / "summary.json").read_text())
+    else:
+        Console().print(end_table(summary, out))
+    if summary.status != "complete":
+        console.print(f"testbed: run {summary.status}: {summary.reason}", markup=False, highlight=False, soft_wrap=True)
+    raise typer.Exit(EXIT_CODES[summary.status])
+
+
+def _file_name(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "._-" else "-" for c in name)

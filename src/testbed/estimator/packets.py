@@ -1,0 +1,83 @@
+"""PACKETS.jsonl: what an estimator received, a line a step; and an estimator run over it, without a network."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
+
+from testbed.errors import TestbedError, UsageError
+from testbed.estimator.model import Ack, Estimator, Model
+
+
+class PacketLine(BaseModel):
+    """One line of PACKETS.jsonl."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    k: Annotated[int, Field(ge=1, strict=True, description="step, 1, 2, … without gaps")]
+    u: Annotated[list[FiniteFloat] | None, Field(description="u_{k−1} as sent")] = None
+    y: Annotated[list[FiniteFloat] | None, Field(description="y_k; null: nothing arrived")] = None
+    gamma: Annotated[
+        Literal[0, 1] | None,
+        Field(description="1 where y is given; 0 with a y: the packet carried only noise"),
+    ] = None
+    acks: Annotated[
+        list[tuple[Annotated[int, Field(ge=0, strict=True)], Literal[0, 1]]],
+        Field(description="[j, ν_j] that became known at this step"),
+    ] = []
+
+    @field_validator("acks", mode="before")
+    @classmethod
+    def _no_acks(cls, value: object) -> object:
+        return [] if value is None else value
+
+
+def read_packets(lines: Iterable[str], model: Model) -> Iterator[PacketLine]:
+    """The lines of a file, checked. Raises UsageError that names the line."""
+    expected = 1
+    for number, text in enumerate(lines, start=1):
+        if not text.strip():
+            continue
+        try:
+            line = PacketLine.model_validate_json(text)
+            _check(line, expected, model)
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_context=False)[0]
+            where = ".".join(map(str, first["loc"])) or "line"
+            raise UsageError(f"line {number}: {where}: {' '.join(first['msg'].split())}") from None
+        except UsageError as error:
+            raise UsageError(f"line {number}: {error}") from None
+        expected += 1
+        yield line
+
+
+def _check(line: PacketLine, expected: int, model: Model) -> None:
+    if line.k != expected:
+        raise UsageError(f"k: got {line.k}; allowed: {expected}, the steps in order without gaps")
+    if len(line.u or ()) != model.q and not (line.u is None and model.q == 0):
+        raise UsageError(f"u: got {len(line.u or ())} numbers; allowed: {model.q}")
+    if line.y is not None and len(line.y) != model.p:
+        raise UsageError(f"y: got {len(line.y)} numbers; allowed: {model.p}, or null")
+    if line.gamma == 1 and line.y is None:
+        raise UsageError("gamma: got 1 without y; allowed: 0 or left out where nothing arrived")
+    for j, _ in line.acks:
+        if j >= line.k:
+            raise UsageError(f"acks: got control packet {j} at step {line.k}; allowed: 0 … {line.k - 1}")
+
+
+def replay(estimator: Estimator, model: Model, packets: Iterable[PacketLine], *, use_acks: bool) -> Iterator[str]:
+    """Lines of OUT.jsonl: k, x_hat, P."""
+    for line in packets:
+        arrived = line.y is not None and line.gamma != 0
+        y = line.y if arrived and line.y is not None else [0.0] * model.p
+        acks = tuple(Ack(j, np.array([nu]), np.array([1])) for j, nu in line.acks) if use_acks else ()
+        try:
+            estimate = estimator.step(np.array([line.u or []]), np.array([y]), np.array([arrived]), acks)
+        except TestbedError as error:
+            raise type(error)(f"step {line.k}: {error}") from None
+        out: dict[str, Any] = {"k": line.k, "x_hat": estimate.x_hat[0].tolist(), "P": estimate.P[0].tolist()}
+        yield json.dumps(out)

@@ -1,0 +1,72 @@
+"""Reading a recording back: the packets of one lane as lines of PACKETS.jsonl."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from numpy.typing import NDArray
+
+from testbed.errors import UsageError
+from testbed.scenario import parse_scenario
+from testbed.wire.codec import Decoder, Rejected
+from testbed.wire.messages import MESSAGES, Message, Packet
+from testbed.wire.setup import Setup
+
+_Arrays = dict[str, NDArray[Any]]
+
+
+def read_recording(path: Path) -> Iterator[tuple[str, Packet, _Arrays]]:
+    """(topic, header, arrays) of every message, in the order of virtual time.
+
+    Raises UsageError where the file is not a recording, OSError where it cannot be read.
+    """
+    with path.open("rb") as file:
+        try:
+            reader = make_reader(file)
+            scenario = next((m.metadata["scenario"] for m in reader.iter_metadata() if m.name == "run"), None)
+            if scenario is None:
+                raise UsageError(f"{path}: not the recording of a run")
+            decoders: dict[str, Decoder[Message]] = {}
+            for schema, channel, message in reader.iter_messages():
+                kind = schema.name if schema is not None else ""
+                if kind not in decoders:
+                    run = json.loads(message.data[8 : 8 + int.from_bytes(message.data[4:8], "little")])["run"]
+                    sizes = Setup(run, parse_scenario(scenario)).sizes
+                    decoders[kind] = Decoder(MESSAGES[kind], run, sizes)
+                header, arrays = decoders[kind].decode(message.data)
+                assert isinstance(header, Packet)
+                yield channel.topic, header, arrays
+        except (McapError, Rejected, KeyError, ValueError) as error:
+            raise UsageError(f"{path}: not a whole recording: {error}") from None
+
+
+def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[str]:
+    """What one lane's estimators received, as lines of PACKETS.jsonl.
+
+    ACKs are those that arrived over the ack link; ``perfect_acks``: those the plant sent.
+    """
+    steps: dict[int, dict[str, Any]] = {}
+    acks_topic = "ack/sent" if perfect_acks else "ack/delivered"
+    for topic, packet, arrays in read_recording(path):
+        row = lane - packet.lane
+        if not 0 <= row < packet.lanes:
+            continue
+        if topic == "control/sent":
+            steps.setdefault(packet.step + 1, {})["u"] = arrays["u"][row].tolist()
+        elif topic == "observation/delivered":
+            arrived = bool(arrays["mask"][row])
+            steps.setdefault(packet.step, {})["y"] = arrays["y"][row].tolist() if arrived else None
+        elif topic == acks_topic and "nu" in arrays and ("mask" not in arrays or arrays["mask"][row]):
+            steps.setdefault(packet.step, {})["acks"] = [[packet.step - 1, int(arrays["nu"][row])]]
+    if not steps:
+        raise UsageError(f"{path}: lane {lane} was not recorded; see `record` in the scenario")
+    whole = [k for k, parts in steps.items() if "u" in parts and "y" in parts]
+    return [
+        json.dumps({"k": k, "u": steps[k]["u"], "y": steps[k]["y"], "acks": steps[k].get("acks", [])})
+        for k in sorted(whole)
+    ]
