@@ -1,0 +1,220 @@
+"""Systems and trials to test estimators on: random, seeded, with every pattern of arrivals and ACKs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from hypothesis import settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+ACKS = ("none", "all", "subset", "late")
+ARRIVALS = ("all", "none", "random")
+CHAINS = ("bernoulli", "markov")
+
+
+def check(examples: int) -> settings:
+    """Hypothesis settings of all property tests here: the same examples in every run, no time limit on one."""
+    return settings(max_examples=examples, deadline=None, derandomize=True)
+
+
+@dataclass(frozen=True)
+class System:
+    """x⁺ = A x + ν B u + w, y = C x + v; ν a chain with P(0→1) = recovery, P(1→0) = failure, P(ν_0 = 1) = start."""
+
+    A: Floats
+    B: Floats
+    C: Floats
+    Q: Floats
+    R: Floats
+    x0_mean: Floats
+    P0: Floats
+    recovery: float
+    failure: float
+    start: float
+
+    @property
+    def n(self) -> int:
+        return int(self.A.shape[0])
+
+    @property
+    def p(self) -> int:
+        return int(self.C.shape[0])
+
+    @property
+    def q(self) -> int:
+        return int(self.B.shape[1])
+
+    def arrival(self, last: int | None) -> float:
+        """P(ν_k = 1 | ν_{k-1} = last); last None: the first packet."""
+        if last is None:
+            return self.start
+        return 1.0 - self.failure if last else self.recovery
+
+    def moved(self, T: Floats) -> System:
+        """The same system in the coordinates T x."""
+        inverse = np.linalg.inv(T)
+        return replace(
+            self,
+            A=T @ self.A @ inverse,
+            B=T @ self.B,
+            C=self.C @ inverse,
+            Q=_symmetric(T @ self.Q @ T.T),
+            x0_mean=T @ self.x0_mean,
+            P0=_symmetric(T @ self.P0 @ T.T),
+        )
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What happens on M lanes over K steps; row k - 1 of u, y, arrived is step k, row j of nu and ack_step is packet j.
+
+    u (K, M, q), y (K, M, p), arrived (K, M), nu (K, M) in {0, 1}, ack_step (K, M): the step at which ν_j becomes
+    known (j + 1 is in time, later is late), 0 if never.
+    """
+
+    system: System
+    u: Floats
+    y: Floats
+    arrived: Bools
+    nu: Ints
+    ack_step: Ints
+
+    @property
+    def steps(self) -> int:
+        return int(self.u.shape[0])
+
+    @property
+    def lanes(self) -> int:
+        return int(self.u.shape[1])
+
+    def known(self, k: int, lane: int) -> dict[int, int]:
+        """{j: ν_j} of all packets that are known at step k, however late."""
+        rows = self.ack_step[:k, lane]
+        return {j: int(self.nu[j, lane]) for j in range(k) if 0 < rows[j] <= k}
+
+    def known_in_time(self, k: int, lane: int) -> dict[int, int]:
+        """{j: ν_j} of the packets j < k that became known at step j + 1."""
+        return {j: int(self.nu[j, lane]) for j in range(k) if self.ack_step[j, lane] == j + 1}
+
+    def of_lanes(self, index: Ints | slice) -> Trial:
+        return replace(
+            self,
+            u=self.u[:, index],
+            y=self.y[:, index],
+            arrived=self.arrived[:, index],
+            nu=self.nu[:, index],
+            ack_step=self.ack_step[:, index],
+        )
+
+
+def _symmetric(S: Floats) -> Floats:
+    return (S + S.T) / 2
+
+
+def _psd(rng: np.random.Generator, n: int, rank: int) -> Floats:
+    root = rng.normal(size=(n, rank))
+    return _symmetric(root @ root.T + (0.1 * np.eye(n) if rank >= n else 0.0))
+
+
+def random_system(
+    rng: np.random.Generator, n: int, p: int, q: int, chain: str = "markov", noise_rank: int | None = None
+) -> System:
+    """Random matrices; spectral radius of A in 0.3 … 1.3; Q of the given rank (full if None)."""
+    A = rng.normal(size=(n, n))
+    A *= rng.uniform(0.3, 1.3) / max(float(np.abs(np.linalg.eigvals(A)).max()), 1e-3)
+    if chain == "bernoulli":
+        rate = float(rng.uniform(0.1, 0.9))
+        recovery, failure, start = rate, 1.0 - rate, rate
+    else:
+        recovery, failure, start = (float(rng.uniform(0.05, 0.95)) for _ in range(3))
+    return System(
+        A=A,
+        B=rng.normal(size=(n, q)) * rng.uniform(0.3, 3.0),
+        C=rng.normal(size=(p, n)),
+        Q=_psd(rng, n, n if noise_rank is None else noise_rank),
+        R=_psd(rng, p, p) + 0.1 * np.eye(p),
+        x0_mean=rng.normal(size=n),
+        P0=_psd(rng, n, int(rng.integers(0, n + 1))),
+        recovery=recovery,
+        failure=failure,
+        start=start,
+    )
+
+
+def _losses(rng: np.random.Generator, system: System, steps: int, lanes: int) -> Ints:
+    nu = np.zeros((steps, lanes), dtype=np.int64)
+    for lane in range(lanes):
+        last: int | None = None
+        for j in range(steps):
+            last = int(rng.random() < system.arrival(last))
+            nu[j, lane] = last
+    return nu
+
+
+def _ack_steps(rng: np.random.Generator, pattern: str, steps: int, lanes: int) -> Ints:
+    in_time = np.broadcast_to(np.arange(1, steps + 1)[:, None], (steps, lanes))
+    if pattern == "none":
+        return np.zeros((steps, lanes), dtype=np.int64)
+    if pattern == "all":
+        return np.array(in_time, dtype=np.int64)
+    arrives = rng.random((steps, lanes)) < 0.6
+    delay = rng.integers(0, 4, size=(steps, lanes)) if pattern == "late" else 0
+    return np.where(arrives, in_time + delay, 0).astype(np.int64)
+
+
+def random_trial(
+    rng: np.random.Generator,
+    system: System,
+    steps: int,
+    lanes: int,
+    acks: str = "none",
+    arrivals: str = "random",
+) -> Trial:
+    """Simulate the system; each lane has its own u, noise, losses and ACKs. y is zero where nothing arrived."""
+    u = rng.normal(size=(steps, lanes, system.q)) * rng.uniform(0.5, 5.0)
+    nu = _losses(rng, system, steps, lanes)
+    arrived = {"all": np.ones, "none": np.zeros}.get(arrivals, np.ones)((steps, lanes), dtype=bool)
+    if arrivals == "random":
+        arrived = rng.random((steps, lanes)) < rng.uniform(0.3, 0.9)
+    x = rng.multivariate_normal(system.x0_mean, system.P0, size=lanes, method="eigh")
+    y = np.zeros((steps, lanes, system.p))
+    for k in range(steps):
+        w = rng.multivariate_normal(np.zeros(system.n), system.Q, size=lanes, method="eigh")
+        x = x @ system.A.T + nu[k][:, None] * (u[k] @ system.B.T) + w
+        y[k] = x @ system.C.T + rng.multivariate_normal(np.zeros(system.p), system.R, size=lanes)
+    y[~arrived] = 0.0
+    return Trial(system, u, y, arrived, nu, _ack_steps(rng, acks, steps, lanes))
+
+
+@st.composite
+def systems(draw: st.DrawFn, chains: tuple[str, ...] = CHAINS) -> System:
+    n = draw(st.integers(1, 3), label="n")
+    p = draw(st.integers(1, 2), label="p")
+    q = draw(st.integers(1, 2), label="q")
+    noise_rank = draw(st.integers(max(0, n - 1), n), label="rank of Q")
+    chain = draw(st.sampled_from(chains), label="chain")
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1), label="seed of the system"))
+    return random_system(rng, n, p, q, chain, noise_rank)
+
+
+@st.composite
+def trials(
+    draw: st.DrawFn,
+    acks: tuple[str, ...] = ACKS,
+    chains: tuple[str, ...] = CHAINS,
+    steps: tuple[int, int] = (1, 6),
+    lanes: tuple[int, int] = (1, 4),
+) -> Trial:
+    system = draw(systems(chains))
+    length = draw(st.integers(*steps), label="steps")
+    width = draw(st.integers(*lanes), label="lanes")
+    ack = draw(st.sampled_from(acks), label="acks")
+    arrivals = draw(st.sampled_from(ARRIVALS), label="arrivals")
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1), label="seed of the trial"))
+    return random_trial(rng, system, length, width, ack, arrivals)
