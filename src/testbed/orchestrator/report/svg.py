@@ -31,7 +31,6 @@ _LOOK: dict[str, Any] = {
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "axes.formatter.use_mathtext": True,
     "axes.formatter.limits": (-3, 5),
     "axes.unicode_minus": True,
     "grid.color": "#e6e6e6",

@@ -42,6 +42,8 @@ def draw(summary: Summary) -> Figure:
         _draw_estimator(axes, summary, index, k, scale)
     _draw_bounds(axes, summary, k)
     axes.set_ylim(scale.low, scale.high)
+    if not scale.log and not 1e-3 <= scale.high < 1e5:
+        axes.ticklabel_format(axis="y", useMathText=True)  # slow to typeset, so only where a power of ten shows
     axes.set_xlabel("step $k$")
     axes.set_ylabel(r"$\mathrm{tr}\,\mathrm{E}[P_k]$,  $\mathrm{E}\,\|x_k-\hat{x}_k\|^2$")
     _legends(figure, summary, scale)
