@@ -1,0 +1,25 @@
+"""Slow tests: skipped unless asked for, and the end of the output says so."""
+
+from __future__ import annotations
+
+import pytest
+
+_REASON = "slow: run with --run-slow"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--run-slow", action="store_true", help="also run the tests marked slow")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--run-slow"):
+        return
+    for item in items:
+        if "slow" in item.keywords:
+            item.add_marker(pytest.mark.skip(reason=_REASON))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    skipped = [r for r in terminalreporter.stats.get("skipped", []) if _REASON in str(r.longrepr)]
+    if skipped:
+        terminalreporter.write_line(f"slow tests skipped: {len(skipped)}; --run-slow runs them too")
