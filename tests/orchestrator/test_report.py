@@ -12,7 +12,8 @@ import pytest
 from orchestrator.fabricated_summary import SCENARIO_TOML, estimator, fabricate
 from testbed.orchestrator.report import write_report
 from testbed.orchestrator.report.figures.covariance import choose_scale
-from testbed.orchestrator.summary import LinkFigures
+from testbed.orchestrator.report.figures.ratio import ratios
+from testbed.orchestrator.summary import BoundFigures, LinkFigures
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -257,3 +258,13 @@ def test_an_upper_bound_that_dwarfs_the_rest_leaves_the_axes():
     far = scale_with([40.0, 50.0], upper=[60.0, 1e6])
     assert far.upper_leaves
     assert far.high < 100
+
+
+def test_ratios_to_the_lower_bound():
+    summary = fabricate(steps=2, estimators={"a": estimator(RNG, FLAT[:2], trace_P_mean=[3.0, 3.0])})
+    bounds = {"lower_mean": [2.0, 0.0], "lower_stderr": [None, None]}
+    (ratio,) = ratios(summary.model_copy(update={"bounds": BoundFigures.model_validate(bounds)}))
+    assert ratio[0] == 1.5
+    assert np.isnan(ratio[1])
+    assert ratios(summary.model_copy(update={"bounds": None})) == []
+    assert ratios(fabricate(steps=2, estimators={})) == []

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from testbed.orchestrator.report import csv_data, svg, text
 from testbed.orchestrator.report.derived import common_band, settled
 from testbed.orchestrator.report.figures import axes, covariance, excess, links, nees
+from testbed.orchestrator.report.figures.ratio import ratios
 from testbed.orchestrator.report.link_model import Expected, expected_links
 from testbed.orchestrator.summary import Summary
 
@@ -51,6 +52,7 @@ def report_html(summary: Summary, scenario_toml: str) -> str:
         stride=axes.stride(summary.completed_steps),
         dots=summary.completed_steps <= axes.DOTS_STEPS_MAX,
         upper_leaves=summary.completed_steps > 0 and covariance.choose_scale(summary).upper_leaves,
+        below=bool(ratios(summary)),
         robust=[name for name, figures in summary.estimators.items() if figures.kind.startswith("rse")],
     )
 

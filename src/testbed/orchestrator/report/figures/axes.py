@@ -17,6 +17,8 @@ from testbed.orchestrator.summary import Z_95
 
 LARGEST = 1.7e308
 """No axis ends beyond it."""
+LOWER_DASH = (0, (5, 2))
+UPPER_DASH = (0, (1, 1.5))
 POINTS_MAX = 2000
 DOTS_STEPS_MAX = 400
 _NAME_LENGTH_MAX = 40

@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 
 from testbed.orchestrator.report.derived import Vector, as_vector
 from testbed.orchestrator.report.figures import axes as common
+from testbed.orchestrator.report.figures.ratio import draw_ratios, ratios
 from testbed.orchestrator.report.svg import GREY, WIDTH_IN, colour, marker
 from testbed.orchestrator.summary import Summary
 
@@ -33,8 +34,12 @@ class Scale:
 
 def draw(summary: Summary) -> Figure:
     """The figure; at least one step must be complete."""
-    figure = Figure(figsize=(WIDTH_IN, 4.0))
-    axes = figure.subplots()
+    if ratios(summary):
+        figure = Figure(figsize=(WIDTH_IN, 5.4))
+        axes, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.6, 1.0])
+    else:
+        figure = Figure(figsize=(WIDTH_IN, 4.0))
+        axes = below = figure.subplots()
     scale = choose_scale(summary)
     axes.set_yscale("log" if scale.log else "linear")
     k = common.steps_axis(axes, summary.completed_steps)
@@ -44,7 +49,11 @@ def draw(summary: Summary) -> Figure:
     axes.set_ylim(scale.low, scale.high)
     if not scale.log and not 1e-3 <= scale.high < 1e5:
         axes.ticklabel_format(axis="y", useMathText=True)  # slow to typeset, so only where a power of ten shows
-    axes.set_xlabel("step $k$")
+    if below is not axes:
+        draw_ratios(below, summary, k)
+        below.set_ylabel("relative to\nlower bound")
+        figure.align_ylabels([axes, below])
+    below.set_xlabel("step $k$")
     axes.set_ylabel(r"$\mathrm{tr}\,\mathrm{E}[P_k]$,  $\mathrm{E}\,\|x_k-\hat{x}_k\|^2$")
     _legends(figure, summary, scale)
     return figure
@@ -125,10 +134,12 @@ def _draw_bounds(axes: Axes, summary: Summary, k: Vector) -> None:
         return
     end = "_" if len(k) == 1 else ""
     lower = common.every(as_vector(summary.bounds.lower_mean))
-    axes.plot(k, lower, color="black", linestyle=(0, (5, 2)), linewidth=1.0, marker=end, markersize=14, zorder=3)
+    axes.plot(k, lower, color="black", linestyle=common.LOWER_DASH, linewidth=1.0, marker=end, markersize=14, zorder=3)
     if summary.bounds.upper_mean is not None:
         upper = common.every(as_vector(summary.bounds.upper_mean))
-        axes.plot(k, upper, color="black", linestyle=(0, (1, 1.5)), linewidth=1.2, marker=end, markersize=14, zorder=3)
+        axes.plot(
+            k, upper, color="black", linestyle=common.UPPER_DASH, linewidth=1.2, marker=end, markersize=14, zorder=3
+        )
 
 
 def _legends(figure: Figure, summary: Summary, scale: Scale) -> None:
@@ -146,12 +157,12 @@ def _legends(figure: Figure, summary: Summary, scale: Scale) -> None:
         meanings[r"$\pm 1.96$ standard errors"] = Patch(color=GREY, alpha=0.25, linewidth=0)
     if summary.bounds is not None:
         meanings[r"lower bound $\mathrm{tr}\,\mathrm{E}[P_k^{\mathrm{A}}]$"] = Line2D(
-            [], [], color="black", linestyle=(0, (5, 2)), linewidth=1.0
+            [], [], color="black", linestyle=common.LOWER_DASH, linewidth=1.0
         )
     if summary.bounds is not None and summary.bounds.upper_mean is not None:
         away = " (leaves the axes)" if scale.upper_leaves else ""
         meanings[rf"upper bound $\mathrm{{tr}}\,\mathrm{{E}}[S_k]${away}"] = Line2D(
-            [], [], color="black", linestyle=(0, (1, 1.5)), linewidth=1.2
+            [], [], color="black", linestyle=common.UPPER_DASH, linewidth=1.2
         )
     if names:
         common.literal_legend(figure, lines, names, loc="outside upper center", ncols=min(len(names), 6))

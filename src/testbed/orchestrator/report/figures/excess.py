@@ -34,7 +34,7 @@ def draw(summary: Summary) -> Figure:
 def _panel(axes: Axes, figures: EstimatorFigures, k: Vector, line_colour: str) -> None:
     excess, stderr = (common.every(values) for values in relative_excess(figures))
     apart = common.every(excess_consistent(figures)) == 0
-    axes.axhline(0.0, color="black", linewidth=0.8, linestyle=(0, (5, 2)))
+    axes.axhline(0.0, color="black", linewidth=0.8, linestyle=common.LOWER_DASH)
     common.fill(axes, k, *common.interval(excess, stderr), line_colour)
     common.single(axes, k, excess, line_colour)
     common.dots(axes, k, excess, apart)
