@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from typing import Annotated
 
 import typer
@@ -24,7 +26,7 @@ app.command("replay")(replay.replay)
 app.command("schema")(schema.schema)
 app.add_typer(link.app, name="link")
 
-_CommandLineError = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+_CommandLineError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 """The base of what typer raises for a wrong command line; some versions of it carry their own copy of click."""
 
 
@@ -52,6 +54,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def run_command(arguments: list[str] | None = None) -> int:
     """The command line as a function: 0 on success, 2 on wrong input, 130 when interrupted, else 1."""
+    _interruptible()
     try:
         code = app(args=arguments, prog_name="testbed", standalone_mode=False)
     except TestbedError as error:
@@ -65,6 +68,13 @@ def run_command(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return code if isinstance(code, int) else 0
+
+
+def _interruptible() -> None:
+    """Ctrl-C and a polite kill both interrupt, also where the shell started us with SIGINT ignored."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _refuse(text: str, code: int) -> int:

@@ -1,4 +1,11 @@
-"""The bounds Pᴬ_k ≤ E_Y[P_k] ≤ S_k of M Theorem 3 (theory.md 3.6), on the losses of each lane."""
+"""The bounds Pᴬ_k ≤ E_Y[P_k] ≤ S_k of M Theorem 3 (theory.md 3.6), on the losses of each lane.
+
+S adds ¼U a step, the largest variance that an unknown ν_k can bring. That accounts for i.i.d. control losses. Under
+Markov losses the ν_k are correlated and their contributions can add up to more: with A = B = C = 1, u = 2, Q = ½,
+P_0 = 0, a chain that never moves from its start ½ and no observation, P_2 = 5 while S_2 = 3. Since
+Cov(ν_i, ν_j) ≤ ¼ |r|^|i−j| with r = 1 − recovery − failure, and by Gershgorin's theorem, ¼U (1 + |r|)/(1 − |r|) a step
+is enough for the best estimator; that is the *correlated* upper bound here.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +13,16 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from testbed.channel.loss import Chain
 from testbed.estimator.model import Model
 from testbed.estimator.riccati import Gain, phi, predict
 from testbed.numerics.lanes import Floats, Matrix, constant, mask_of, matrices_of
+
+
+def correlation_factor(control: Chain) -> float | None:
+    """(1 + |r|)/(1 − |r|) of the control losses: 1 for i.i.d. ones, None where it is infinite."""
+    r = 0.0 if control.independent or control.never_loses else abs(1.0 - control.recovery - control.failure)
+    return (1.0 + r) / (1.0 - r) if r < 1.0 else None
 
 
 class Bounds:

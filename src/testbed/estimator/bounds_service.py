@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.errors import RunFailed
-from testbed.estimator.bounds import Bounds
+from testbed.estimator.bounds import Bounds, correlation_factor
 from testbed.estimator.registry import model_of
 from testbed.numerics.lanes import Component, trace
 from testbed.plant.inputs import control_bound
@@ -21,11 +21,17 @@ ROLE = "bounds"
 
 
 class BoundsService:
-    """Publishes the traces of Pᴬ_k and S_k of every lane."""
+    """Publishes the traces of Pᴬ_k and S_k of every lane, and under Markov control losses of the correlated S_k."""
 
     def __init__(self, node: Node, setup: Setup) -> None:
         model, bound = model_of(setup.scenario), control_bound(setup.scenario)
+        factor = correlation_factor(model.control)
         self._blocks = {lane: Bounds(model, bound, lanes) for lane, lanes in setup.blocks}
+        self._correlated = {
+            lane: Bounds(model, factor * bound, lanes)
+            for lane, lanes in setup.blocks
+            if bound is not None and factor is not None and factor > 1.0
+        }
         self._send = node.sender(node.keys.bounds, BoundsMessage)
         self.counters: dict[str, int] = {}
         node.on(node.keys.delivered("observation"), Observation, "link.observation", self._take)
@@ -36,6 +42,10 @@ class BoundsService:
         traces = {"trace_lower": _lanes(trace(lower), packet.lanes)}
         if upper is not None:
             traces["trace_upper"] = _lanes(trace(upper), packet.lanes)
+        if packet.lane in self._correlated:
+            _, correlated = self._correlated[packet.lane].components(arrays["mask"])
+            if correlated is not None:
+                traces["trace_upper_correlated"] = _lanes(trace(correlated), packet.lanes)
         if not all(all_finite(values) for values in traces.values()):
             raise RunFailed(f"the bounds left the range of floating-point numbers at step {packet.step}")
         self._send(packet.step, packet.lane, packet.lanes, traces)

@@ -11,3 +11,7 @@ class MissingAck(TestbedError):
 
 class TooManyHistories(TestbedError):
     """Exact enumeration has reached its limit."""
+
+
+class ContradictoryAck(TestbedError):
+    """An ACK reports what the model of the control link gives probability zero."""

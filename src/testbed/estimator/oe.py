@@ -14,7 +14,7 @@ from annotated_types import Ge
 from numpy.typing import NDArray
 
 from testbed.errors import UsageError
-from testbed.estimator.errors import TooManyHistories
+from testbed.estimator.errors import ContradictoryAck, TooManyHistories
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.riccati import Gain, phi, predict
 from testbed.numerics.lanes import (
@@ -38,20 +38,21 @@ MAX_HISTORIES = 65536
 class _Group:
     """Lanes with the same undecided control packets.
 
-    lanes (G,); undecided: packet numbers, oldest first; means: n arrays (G, H), weights (G, H), H = 2^undecided: the
-    bits of a hypothesis' index are the fates of the undecided packets, the newest in the lowest bit; last (G,): ν of
-    the newest packet where that is decided, else None.
+    lanes (G,); undecided: packet numbers, oldest first; means: n arrays (G, H); scores (G, H): logarithms of the
+    weights up to a constant a lane, the largest 0, so that no history that data may yet revive underflows;
+    H = 2^undecided: the bits of a hypothesis' index are the fates of the undecided packets, the newest in the lowest
+    bit; last (G,): ν of the newest packet where that is decided, else None.
     """
 
     lanes: NDArray[np.intp]
     undecided: tuple[int, ...]
     means: list[Floats]
-    weights: Floats
+    scores: Floats
     last: Floats | None
 
     def select(self, rows: NDArray[np.bool_]) -> _Group:
         last = None if self.last is None else self.last[rows]
-        return _Group(self.lanes[rows], self.undecided, [m[rows] for m in self.means], self.weights[rows], last)
+        return _Group(self.lanes[rows], self.undecided, [m[rows] for m in self.means], self.scores[rows], last)
 
 
 class Oe:
@@ -61,7 +62,7 @@ class Oe:
         self._model, self._lanes, self._limit = model, lanes, max_histories
         _, self._p = model.prior(lanes)
         start = _Group(
-            np.arange(lanes), (), [np.full((lanes, 1), float(v)) for v in model.x0_mean], np.ones((lanes, 1)), None
+            np.arange(lanes), (), [np.full((lanes, 1), float(v)) for v in model.x0_mean], np.zeros((lanes, 1)), None
         )
         self._groups = [start]
         self._k = 0
@@ -126,23 +127,23 @@ class Oe:
     def _branch(self, group: _Group, packet: int, push: Vector, acks: tuple[Ack, ...]) -> _Group:
         """One move of the plant: each hypothesis splits in two, or none does where ν is known."""
         model = self._model
-        moved = [np.broadcast_to(m, group.weights.shape) for m in constant_times(model.a, list(group.means))]
+        moved = [np.broadcast_to(m, group.scores.shape) for m in constant_times(model.a, list(group.means))]
         shift = [b[group.lanes][:, None] for b in push] or [np.zeros((len(group.lanes), 1))] * model.n
         nu = self._known_nu(group, packet, acks)
         if nu is not None:
             means = [m + nu[:, None] * s for m, s in zip(moved, shift, strict=True)]
             arrival = self._arrival(group)
-            weights = group.weights * np.where(nu[:, None] == 1.0, arrival, 1.0 - arrival)
-            return _Group(group.lanes, group.undecided, means, _normalised(weights), nu)
-        if 2 * group.weights.shape[1] > self._limit:
+            scores = group.scores + _log(np.where(nu[:, None] == 1.0, arrival, 1.0 - arrival))
+            return _Group(group.lanes, group.undecided, means, _levelled(scores), nu)
+        if 2 * group.scores.shape[1] > self._limit:
             raise TooManyHistories(
-                f"oe would need {2 * group.weights.shape[1]} histories at step {self._k}; the limit is "
+                f"oe would need {2 * group.scores.shape[1]} histories at step {self._k}; the limit is "
                 f"max_histories = {self._limit}: stop it earlier (until = {self._k - 1}), give it ACKs, or use aoe"
             )
         arrival = self._arrival(group)
         means = [_interleave(m, m + s) for m, s in zip(moved, shift, strict=True)]
-        weights = _interleave(group.weights * (1.0 - arrival), group.weights * arrival)
-        return _Group(group.lanes, (*group.undecided, packet), means, weights, None)
+        scores = _interleave(group.scores + _log(1.0 - arrival), group.scores + _log(arrival))
+        return _Group(group.lanes, (*group.undecided, packet), means, scores, None)
 
     def _known_nu(self, group: _Group, packet: int, acks: tuple[Ack, ...]) -> Floats | None:
         if self._model.control.never_loses:
@@ -159,7 +160,7 @@ class Oe:
             return np.full((1, 1), chain.start)
         if group.last is not None:
             return np.where(group.last == 1.0, 1.0 - chain.failure, chain.recovery)[:, None]
-        newest = np.arange(group.weights.shape[1]) % 2 == 1
+        newest = np.arange(group.scores.shape[1]) % 2 == 1
         return np.where(newest, 1.0 - chain.failure, chain.recovery)[None, :]
 
     def _observe(self, group: _Group, gain: Gain, y: Vector, observed: NDArray[np.bool_]) -> _Group:
@@ -174,24 +175,25 @@ class Oe:
         predicted = constant_times(gain.C, list(group.means))
         innovation = [of_group(a) - b for a, b in zip(y, predicted, strict=True)]
         factor: Cholesky = gain.innovation.mapped(of_group)
-        log_likelihood = -0.5 * np.broadcast_to(factor.quadratic(innovation), group.weights.shape)
-        relative = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
-        updated = _normalised(group.weights * relative)
+        log_likelihood = -0.5 * np.broadcast_to(factor.quadratic(innovation), group.scores.shape)
+        updated = _levelled(group.scores + log_likelihood)
         means = [np.where(here[:, None], m + dot(row, innovation), m) for m, row in zip(group.means, k, strict=True)]
-        weights = np.where(here[:, None], updated, group.weights)
-        return _Group(group.lanes, group.undecided, means, weights, group.last)
+        scores = np.where(here[:, None], updated, group.scores)
+        return _Group(group.lanes, group.undecided, means, scores, group.last)
 
     def _moments(self) -> Estimate:
         n = self._model.n
         mean = np.empty((self._lanes, n))
         spread = np.empty((self._lanes, n, n))
         for group in self._groups:
-            centre = [(group.weights * m).sum(axis=1) for m in group.means]
+            weights = np.exp(group.scores)
+            weights /= weights.sum(axis=1, keepdims=True)
+            centre = [(weights * m).sum(axis=1) for m in group.means]
             away = [m - c[:, None] for m, c in zip(group.means, centre, strict=True)]
             for i in range(n):
                 mean[group.lanes, i] = centre[i]
                 for j in range(i, n):
-                    spread[group.lanes, i, j] = (group.weights * away[i] * away[j]).sum(axis=1)
+                    spread[group.lanes, i, j] = (weights * away[i] * away[j]).sum(axis=1)
         between = matrix_of(spread)
         p = symmetric(n, lambda i, j: self._p[i][j] + between[i][j])
         return Estimate(vector_of(mean), p, self._lanes)
@@ -204,8 +206,17 @@ def _interleave(a: Floats, b: Floats) -> Floats:
     return out
 
 
-def _normalised(weights: Floats) -> Floats:
-    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+def _levelled(scores: Floats) -> Floats:
+    """The same weights with the largest score of each lane at 0. Raises ContradictoryAck if all are impossible."""
+    top = scores.max(axis=1, keepdims=True)
+    if not np.isfinite(top).all():
+        raise ContradictoryAck("an ACK says what the model of the control link holds to be impossible")
+    return np.asarray(scores - top)
+
+
+def _log(probability: Floats) -> Floats:
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(probability))
 
 
 def _decide(group: _Group, j: int, nu: NDArray[Any], newest: int) -> _Group:
@@ -221,7 +232,7 @@ def _decide(group: _Group, j: int, nu: NDArray[Any], newest: int) -> _Group:
 
     undecided = tuple(i for i in group.undecided if i != j)
     last = fate.astype(np.float64) if j == newest else group.last
-    return _Group(group.lanes, undecided, [keep(m) for m in group.means], _normalised(keep(group.weights)), last)
+    return _Group(group.lanes, undecided, [keep(m) for m in group.means], _levelled(keep(group.scores)), last)
 
 
 def _joined(groups: list[_Group]) -> list[_Group]:
@@ -239,6 +250,6 @@ def _concatenated(groups: list[_Group]) -> _Group:
         np.concatenate([g.lanes for g in groups]),
         first.undecided,
         [np.concatenate([g.means[i] for g in groups]) for i in range(len(first.means))],
-        np.concatenate([g.weights for g in groups]),
+        np.concatenate([g.scores for g in groups]),
         last,
     )

@@ -93,7 +93,8 @@ def _checked(kind: str, factory: Callable[..., Estimator], options: dict[str, An
         if name not in allowed:
             listed = ", ".join(allowed) if allowed else "none"
             raise UsageError(
-                f"estimator {kind!r}: unknown option {name!r}; allowed: {listed}{did_you_mean(name, allowed)}"
+                f"estimator {kind!r}: unknown option {name!r}; allowed: {listed}"
+                f"{did_you_mean(name, [*allowed, *EstimatorSpec.reserved])}"
             )
     for parameter in parameters:
         if parameter.name not in options and parameter.default is inspect.Parameter.empty:

@@ -17,6 +17,7 @@ from testbed.numerics.lanes import Component, Floats
 _SCALE = 1126  # 1074 for the smallest subnormal, 52 to spare
 _SPLITTER = 134217729.0  # 2^27 + 1 (Veltkamp)
 _LARGEST = 1e150  # beyond it squares overflow
+_FEW = 32  # up to here adding one by one is faster
 
 
 def exact_parts(x: Floats) -> list[float]:
@@ -70,6 +71,9 @@ class ExactMoments:
         """Take in one value a lane: a ``float`` or an array of shape (M,)."""
         if isinstance(x, float):
             self._add_one(x)
+        elif len(x) <= _FEW:
+            for value in x.tolist():
+                self._add_one(value)
         else:
             self._add_array(x)
 

@@ -34,7 +34,7 @@ class Collector:
         self._with_bounds = scenario.bounds
         self._steps = scenario.steps
         self.estimators = {spec.name: Series(ERROR_FIGURES) for spec in scenario.estimators}
-        self.bounds = Series(("lower", "upper"))
+        self.bounds = Series(("lower", "upper", "upper_correlated"))
         self.completed = 0
         self.applied = 0
         """Lane-packets of control that the plant says it applied."""
@@ -64,8 +64,9 @@ class Collector:
 
     def bound(self, step: int, lane: int, arrays: Arrays) -> None:
         figures = {"lower": _component(arrays["trace_lower"])}
-        if "trace_upper" in arrays:
-            figures["upper"] = _component(arrays["trace_upper"])
+        for name in ("upper", "upper_correlated"):
+            if f"trace_{name}" in arrays:
+                figures[name] = _component(arrays[f"trace_{name}"])
         self.bounds.add(step, figures)
         self._of(step, lane)
         self._done(step, lane, "bounds")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import shlex
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -76,6 +77,7 @@ class Run:
             conductor = self._conductor(bus, recorder)
             interrupted = False
             try:
+                threading.Thread(target=_import_report, daemon=True).start()
                 for role in self._roles:
                     if role.name in external:
                         self._say(f"start {role.name} by hand: {shlex.join(self._by_hand(role, endpoint))}")
@@ -85,9 +87,10 @@ class Run:
             except KeyboardInterrupt:
                 interrupted = True
             self._settle(conductor, bus)
+            supervisor.close(_LEAVE_S if conductor.collector.finished else 0.2)
             return self._finish(conductor, interrupted=interrupted)
         finally:
-            supervisor.close(0.0 if self._failed else _LEAVE_S)
+            supervisor.close(0.0)
             if recorder is not None:
                 recorder.close()
             session.close()  # type: ignore[no-untyped-call]
@@ -122,8 +125,6 @@ class Run:
         finally:
             if recorder is not None:
                 recorder.close()
-
-    _failed = False
 
     def _conductor(self, bus: object, recorder: Recorder | None) -> Conductor:
         conductor = Conductor(bus, self._setup, [role.name for role in self._roles], recorder)  # type: ignore[arg-type]
@@ -160,14 +161,15 @@ class Run:
                 conductor.fail(f"no progress for {deadline_s:g} s; waiting for {conductor.awaiting()}")
         if conductor.failure is not None and conductor.failure.endswith(" is gone"):
             role = conductor.failure.removesuffix(" is gone")
-            ending = supervisor.ending_of(role)
-            if ending is not None:
-                conductor.failure = f"{role} ended: {ending}{_last_words(supervisor.log_of(role))}"
+            if (how := supervisor.ending_of(role)) is not None:
+                conductor.failure = f"{role} ended: {how}{_last_words(supervisor.log_of(role))}"
 
     def _settle(self, conductor: Conductor, bus: object) -> None:
         """Stop the roles and hear their last words."""
         conductor.stop()
-        deadline = time.monotonic() + (5.0 if conductor.collector.finished else 0.5)
+        if conductor.failure is not None:
+            self._say(f"stopping: {conductor.failure}")
+        deadline = time.monotonic() + (5.0 if conductor.collector.finished else 0.4)
         while not conductor.all_reported and time.monotonic() < deadline:
             bus.run(0.02)  # type: ignore[attr-defined]
 
@@ -197,7 +199,6 @@ class Run:
         else:
             status, reason = "complete", None
         summary = summarise(conductor, status=status, reason=reason, timing=timing)
-        self._failed = summary.status != "complete"
         write_results(self._out, summary, self._setup.scenario)
         return summary
 
@@ -213,6 +214,11 @@ def write_results(out: Path, summary: Summary, scenario: Scenario) -> None:
         write_report(out / "report.html", summary, toml)
     except OSError as error:
         raise RunFailed(f"cannot write the results into {out}: {error.strerror}") from None
+
+
+def _import_report() -> None:
+    """Load what draws the report while the roles start, so that a run that fails can end at once."""
+    import testbed.orchestrator.report  # noqa: F401
 
 
 def _last_words(log: Path) -> str:

@@ -83,6 +83,10 @@ class BoundFigures(_Model):
     lower_stderr: Series
     upper_mean: Series | None = None
     upper_stderr: Series | None = None
+    upper_correlated_mean: Series | None = Field(
+        default=None, description="S for Markov control losses: with U (1 + |r|)/(1 − |r|), r = 1 − recovery − failure"
+    )
+    upper_correlated_stderr: Series | None = None
     upper_reason: str | None = Field(default=None, description="why there is no upper bound")
 
 

@@ -126,6 +126,9 @@ class BoundsMessage(Packet):
     ARRAYS: ClassVar[dict[str, ArrayRule]] = {
         "trace_lower": _floats("lanes", text="tr Pᴬ_k"),
         "trace_upper": _floats("lanes", text="tr S_k; absent for an input without a bound", required=False),
+        "trace_upper_correlated": _floats(
+            "lanes", text="tr S_k with room for correlated control losses; only under Markov ones", required=False
+        ),
     }
 
 
