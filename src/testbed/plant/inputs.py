@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from testbed.numerics.lanes import Floats, array_of
 from testbed.numerics.streams import Stream
@@ -31,24 +32,28 @@ def open_loop(scenario: Scenario, lane: int, lanes: int) -> InputSource:
         stream = Stream(scenario.seed, "controller", "input", width=q, lane=lane, lanes=lanes)
         low, high = _channels(source.low, q), _channels(source.high, q)
         return lambda k: low + (high - low) * array_of(stream.uniforms(k), lanes)
-    return lambda k: np.tile(deterministic(scenario, k), (lanes, 1))
+    law = deterministic(scenario)
+    return lambda k: np.tile(law(np.array([k])), (lanes, 1))
 
 
-def deterministic(scenario: Scenario, k: int) -> Floats:
-    """u_k of shape (q,) of an input that is the same in every lane."""
+def deterministic(scenario: Scenario) -> Callable[[NDArray[np.int64]], Floats]:
+    """The input that is the same in every lane, as a function from steps (K,) to u (K, q)."""
     source, q = scenario.input, scenario.system.q
     if source is None:
-        return np.zeros(q)
+        return lambda k: np.zeros((len(k), 0))
     if isinstance(source, ConstantInput):
-        return np.array(source.value)
+        value = np.array(source.value)
+        return lambda k: np.tile(value, (len(k), 1))
     if isinstance(source, ExponentialInput):
-        decay = np.exp(-k / _channels(source.tau, q))
-        return _channels(source.offset, q) + _channels(source.amplitude, q) * decay
+        offset, amplitude, tau = (_channels(v, q) for v in (source.offset, source.amplitude, source.tau))
+        return lambda k: offset + amplitude * np.exp(-k[:, None] / tau)
     if isinstance(source, SineInput):
-        angle = 2.0 * np.pi * k / _channels(source.period, q) + _channels(source.phase, q)
-        return _channels(source.offset, q) + _channels(source.amplitude, q) * np.sin(angle)
+        offset, amplitude, phase = (_channels(v, q) for v in (source.offset, source.amplitude, source.phase))
+        period = _channels(source.period, q)
+        return lambda k: offset + amplitude * np.sin(2.0 * np.pi * k[:, None] / period + phase)
     if isinstance(source, TableInput):
-        return np.array(source.values[k])
+        table = np.array(source.values)
+        return lambda k: table[k]
     raise TypeError(f"input {source.kind!r} is not the same in every lane")
 
 
@@ -68,7 +73,8 @@ def control_bound(scenario: Scenario) -> Floats | None:
         largest = np.maximum(np.abs(_channels(source.low, q)), np.abs(_channels(source.high, q)))
         peak = float(largest @ largest)
     else:
-        peak = max(float(u @ u) for u in (deterministic(scenario, k) for k in range(scenario.steps)))
+        u = deterministic(scenario)(np.arange(scenario.steps))
+        peak = float(np.max(np.sum(u * u, axis=1)))
     return np.asarray(peak * (b @ b.T))
 
 

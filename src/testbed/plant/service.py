@@ -29,7 +29,7 @@ class PlantService:
         self._ack = node.sender(keys.sent("ack"), Acknowledgement, tap=True)
         self._observe = node.sender(keys.sent("observation"), Observation, tap=True)
         self.counters: dict[str, int] = {}
-        node.on(keys.delivered("control"), Control, "link.control", self._move)
+        node.on(keys.delivered("control"), Control, "link.control", self._move, needs=("mask",))
 
     def _move(self, packet: Control, arrays: dict[str, NDArray[Any]]) -> None:
         lane, lanes, step = packet.lane, packet.lanes, packet.step + 1

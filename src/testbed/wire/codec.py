@@ -108,19 +108,22 @@ class Decoder(Generic[M]):
         if payload[:4] != MAGIC:
             raise Rejected("format", "the payload does not begin with NCS1")
         length = int.from_bytes(payload[4:8], "little")
-        if length > MAX_HEADER or 8 + length > len(payload):
+        if length > MAX_HEADER or length % 8 or 8 + length > len(payload):
             raise Rejected("format", f"header of {length} bytes in a payload of {len(payload)}")
         try:
             header = cast(M, self._validate(payload[8 : 8 + length]))
         except ValidationError as error:
             raise Rejected("schema", _first_error(error)) from None
+        if not header.ALWAYS <= header.model_fields_set:
+            raise Rejected("schema", f"{', '.join(sorted(header.ALWAYS - header.model_fields_set))}: Field required")
         if header.run != self._run:
             raise Rejected("run", f"of run {header.run}, this is {self._run}")
         if not isinstance(header, Packet):
             if len(payload) != 8 + length:
                 raise Rejected("format", f"{len(payload) - 8 - length} bytes behind a header without arrays")
             return header, {}
-        if header.step > self._sizes.steps or header.lane + header.lanes > self._sizes.lanes:
+        past = header.step - header.FIRST_STEP
+        if not 0 <= past < self._sizes.steps or header.lane + header.lanes > self._sizes.lanes:
             raise Rejected("range", f"step {header.step}, lanes {header.lane}…{header.lane + header.lanes - 1}")
         return header, self._arrays(header, payload, 8 + length)
 
@@ -148,6 +151,8 @@ class Decoder(Generic[M]):
             raise Rejected("format", f"payload of {len(payload)} bytes, arrays end at {offset}")
         if not self._required <= out.keys():
             raise Rejected("arrays", f"missing {', '.join(sorted(self._required - out.keys()))}")
+        if len(out) == 1 and "mask" in out and out["mask"].any():
+            raise Rejected("arrays", "the mask says that something arrived and nothing is there")
         return out
 
     def _shape(self, symbols: tuple[str, ...], lanes: int) -> tuple[int, ...]:
@@ -158,9 +163,10 @@ def all_finite(x: NDArray[np.float64]) -> bool:
     """Whether every entry of a flat array is finite, reading each once in the common case.
 
     The product of the two halves is finite only if every factor is; if it is not, it may be an overflow: look closely.
+    vdot, unlike dot, does not warn of that.
     """
     half = len(x) // 2
-    if len(x) > 1 and math.isfinite(np.dot(x[:half], x[half : 2 * half])):
+    if len(x) > 1 and math.isfinite(np.vdot(x[:half], x[half : 2 * half])):
         return len(x) % 2 == 0 or math.isfinite(x[-1])
     return bool(np.isfinite(x).all())
 

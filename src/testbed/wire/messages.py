@@ -47,8 +47,10 @@ class Message(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
     ARRAYS: ClassVar[dict[str, ArrayRule]] = {}
+    ALWAYS: ClassVar[frozenset[str]] = frozenset({"v", "type"})
+    """Fields that have a default here and are required in a header."""
 
-    v: Annotated[Literal[1], Field(description="version of the protocol")] = 1
+    v: Annotated[int, Field(ge=PROTOCOL, le=PROTOCOL, description="version of the protocol")] = PROTOCOL
     type: str
     run: RunId
     source: Name
@@ -62,6 +64,7 @@ class Packet(Message):
     lane: Annotated[Count, Field(description="first lane of the packet")]
     lanes: Annotated[int, Field(ge=1, le=2**31, description="number of lanes")]
     arrays: tuple[ArrayEntry, ...] = ()
+    FIRST_STEP: ClassVar[int] = 1
 
 
 _MASK = _bits(
@@ -73,6 +76,7 @@ class Control(Packet):
     """u_k. Behind the link: with the arrival mask; without ``u`` if it arrived in no lane."""
 
     type: Literal["control"] = "control"
+    FIRST_STEP: ClassVar[int] = 0
     ARRAYS: ClassVar[dict[str, ArrayRule]] = {
         "u": _floats("lanes", "q", required=False, text="control input u_k"),
         "mask": _MASK,
@@ -152,8 +156,8 @@ class Status(Message):
     type: Literal["status"] = "status"
     state: Literal["failed", "stopped"]
     detail: Annotated[str, Field(max_length=2000)] = ""
-    counters: dict[str, int] = {}
-    rejected: Annotated[dict[str, int], Field(description="refused messages by reason")] = {}
+    counters: dict[str, Count] = {}
+    rejected: Annotated[dict[str, Count], Field(description="refused messages by reason")] = {}
 
 
 MESSAGES: dict[str, type[Message]] = {
@@ -175,6 +179,7 @@ def messages_json_schema() -> dict[str, Any]:
     for name, model in MESSAGES.items():
         schema = model.model_json_schema()
         schema.pop("$defs", None)
+        schema["required"] = [*sorted(model.ALWAYS, reverse=True), *schema["required"]]
         if model.ARRAYS:
             schema["x-arrays"] = {key: rule.model_dump() for key, rule in model.ARRAYS.items()}
         definitions[name] = schema
@@ -183,7 +188,7 @@ def messages_json_schema() -> dict[str, Any]:
         "title": "Messages of a testbed run",
         "description": (
             "A payload is: the four bytes 'NCS1'; the header's length in bytes as a little-endian uint32; the header, "
-            "JSON in UTF-8, padded with spaces to a multiple of 8; then the arrays in the order of 'arrays' "
+            "JSON in UTF-8 (integers without a decimal point), padded with spaces to a multiple of 8; then the arrays in the order of 'arrays' "
             "(name, dtype, shape), C order, little-endian, each padded with zero bytes to a multiple of 8. "
             "'x-arrays' says which arrays a type may have; 'lanes' there is the field, n, p, q are the sizes of the "
             "state, the observation and the input."

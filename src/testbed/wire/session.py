@@ -53,7 +53,7 @@ def config(transport: Transport, mode: str, *, listen: str | None = None, connec
         "mode": mode,
         "listen/endpoints": [] if listen is None else [listen],
         "connect/endpoints": [] if connect is None else [connect],
-        "connect/timeout_ms": int(transport.deadline_ns / 1e6),
+        "connect/timeout_ms": int(transport.deadline_ns / 2e6),
         "connect/exit_on_failure": True,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
