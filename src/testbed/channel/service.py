@@ -18,12 +18,12 @@ from testbed.wire.messages import Acknowledgement, Control, Observation, Packet
 from testbed.wire.node import Node
 from testbed.wire.setup import Setup
 
-_TYPES: dict[LinkName, tuple[type[Packet], str, str, int]] = {
-    "control": (Control, "controller", "u", 0),
-    "observation": (Observation, "plant", "y", 1),
-    "ack": (Acknowledgement, "plant", "nu", 1),
+_TYPES: dict[LinkName, tuple[type[Packet], str, str]] = {
+    "control": (Control, "controller", "u"),
+    "observation": (Observation, "plant", "y"),
+    "ack": (Acknowledgement, "plant", "nu"),
 }
-"""Type, sender, content and the step of packet 0."""
+"""Type, sender and content."""
 
 
 def role_of(link: LinkName) -> str:
@@ -51,11 +51,11 @@ class LinkService:
     """
 
     def __init__(self, node: Node, setup: Setup, *, link: LinkName) -> None:
-        model, sender, self._content, self._first = _TYPES[link]
+        model, sender, self._content = _TYPES[link]
         self._losses = {lane: loss_process(setup.scenario, link, lane, lanes) for lane, lanes in setup.blocks}
         self._counts = LossCounts()
         self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
-        node.on(node.keys.sent(link), model, sender, self._pass_on)
+        node.on(node.keys.sent(link), model, sender, self._pass_on, needs=(self._content,))
 
     @property
     def counters(self) -> dict[str, int]:
@@ -63,7 +63,7 @@ class LinkService:
 
     def _pass_on(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         lane = packet.lane
-        arrived = self._losses[lane].next(packet.step - self._first)
+        arrived = self._losses[lane].next(packet.step - packet.FIRST_STEP)
         self._counts.count(lane, arrived)
         self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
 

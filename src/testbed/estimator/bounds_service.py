@@ -34,7 +34,7 @@ class BoundsService:
         }
         self._send = node.sender(node.keys.bounds, BoundsMessage)
         self.counters: dict[str, int] = {}
-        node.on(node.keys.delivered("observation"), Observation, "link.observation", self._take)
+        node.on(node.keys.delivered("observation"), Observation, "link.observation", self._take, needs=("mask",))
 
     def _take(self, packet: Observation, arrays: dict[str, NDArray[Any]]) -> None:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):

@@ -68,12 +68,14 @@ class EstimatorService:
             for lane, lanes in setup.blocks
         }
         keys = node.keys
-        node.on(keys.sent("control"), Control, "controller", partial(self._take, "u", 1))
-        node.on(keys.delivered("observation"), Observation, "link.observation", partial(self._take, "y", 0))
+        take_u, take_y = partial(self._take, "u", 1), partial(self._take, "y", 0)
+        take_ack = partial(self._take, "ack", 0)
+        node.on(keys.sent("control"), Control, "controller", take_u, needs=("u",))
+        node.on(keys.delivered("observation"), Observation, "link.observation", take_y, needs=("mask",))
         if acks == "perfect":
-            node.on(keys.sent("ack"), Acknowledgement, "plant", partial(self._take, "ack", 0))
+            node.on(keys.sent("ack"), Acknowledgement, "plant", take_ack, needs=("nu",))
         elif acks == "link":
-            node.on(keys.delivered("ack"), Acknowledgement, "link.ack", partial(self._take, "ack", 0))
+            node.on(keys.delivered("ack"), Acknowledgement, "link.ack", take_ack, needs=("mask",))
 
     @property
     def counters(self) -> dict[str, int]:

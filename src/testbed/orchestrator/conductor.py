@@ -103,7 +103,7 @@ class Conductor:
         node.on(keys.truth, Truth, PLANT, self._truth)
         for spec in scenario.estimators:
             take = partial(self._estimate, spec.name, f"estimate/{spec.name}")
-            node.on(keys.estimate(spec.name), EstimateMessage, estimator_role(spec.name), take)
+            node.on(keys.estimate(spec.name), EstimateMessage, estimator_role(spec.name), take, last=spec.until)
         if scenario.bounds:
             node.on(keys.bounds, BoundsMessage, BOUNDS, self._bounds)
         if self._recorder is not None:
@@ -125,7 +125,8 @@ class Conductor:
     def _record(self, key: str, model: type[Packet], source: str, topic: str) -> None:
         assert self._recorder is not None
         whole = self.setup.tap >= self.setup.sizes.lanes
-        self.node.on(key if whole else self.node.keys.tap(key), model, source, partial(self._recorder.write, topic))
+        taken = key if whole else self.node.keys.tap(key)
+        self.node.on(taken, model, source, partial(self._recorder.write, topic), cut=not whole)
 
     def _presence(self, key: str, alive: bool) -> None:
         role = key.rsplit("/", 1)[1]

@@ -37,13 +37,14 @@ class Rejected(ValueError):
 
 @dataclass(frozen=True)
 class Sizes:
-    """The sizes that a run's packets must have."""
+    """The sizes that a run's packets must have; ``lanes_per_packet``: how the lanes are split, None for any split."""
 
     n: int
     p: int
     q: int
     lanes: int
     steps: int
+    lanes_per_packet: int | None = None
 
 
 def entries_of(arrays: Arrays) -> tuple[ArrayEntry, ...]:
@@ -114,7 +115,7 @@ class Decoder(Generic[M]):
             header = cast(M, self._validate(payload[8 : 8 + length]))
         except ValidationError as error:
             raise Rejected("schema", _first_error(error)) from None
-        if not header.ALWAYS <= header.model_fields_set:
+        if not header.model_fields_set >= header.ALWAYS:
             raise Rejected("schema", f"{', '.join(sorted(header.ALWAYS - header.model_fields_set))}: Field required")
         if header.run != self._run:
             raise Rejected("run", f"of run {header.run}, this is {self._run}")

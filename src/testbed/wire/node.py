@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
@@ -58,9 +59,26 @@ class Node:
 
         return send_both
 
-    def on(self, key: str, model: type[M], source: str, handler: PacketHandler[M]) -> None:
-        """Call ``handler(header, arrays)`` for each valid message of ``source`` on ``key``; count the others."""
-        decoder = Decoder(model, self.run, self.sizes)
+    def on(
+        self,
+        key: str,
+        model: type[M],
+        source: str,
+        handler: PacketHandler[M],
+        *,
+        needs: tuple[str, ...] = (),
+        last: int | None = None,
+        cut: bool = False,
+    ) -> None:
+        """Call ``handler(header, arrays)`` for each valid message of ``source`` on ``key``; count the others.
+
+        Packets come as the run splits the lanes, and the steps of each block one after the other.
+
+        needs: arrays that a packet must have here. last: the last step, where it is not that of the run. cut: packets
+        hold the recorded lanes only.
+        """
+        sizes = self.sizes if last is None else replace(self.sizes, steps=last)
+        decoder, turns = Decoder(model, self.run, sizes), _Turns(None if cut else sizes.lanes_per_packet, sizes.lanes)
         expected = 0
 
         def receive(_: str, payload: bytes) -> None:
@@ -71,10 +89,14 @@ class Node:
                     raise Rejected("source", f"from {header.source}, expected {source}")
                 if header.seq != expected:
                     raise Rejected("sequence", f"number {header.seq}, expected {expected}")
+                expected += 1
+                if isinstance(header, Packet):
+                    turns.check(header)
+                    if needs and not arrays.keys() >= set(needs):
+                        raise Rejected("arrays", f"lacks one of {', '.join(needs)}")
             except Rejected as refusal:
                 self.rejected[refusal.reason] += 1
                 return
-            expected += 1
             handler(header, arrays)
 
         self.bus.subscribe(key, receive)
@@ -100,6 +122,23 @@ class Node:
     def _obey(self, command: Command, _: dict[str, NDArray[Any]]) -> None:
         if command.action == "stop":
             self.stopped = True
+
+
+class _Turns:
+    """Which packets are due on one key: whole blocks of lanes, the steps of each in order."""
+
+    def __init__(self, per_packet: int | None, lanes: int) -> None:
+        self._per_packet, self._lanes = per_packet, lanes
+        self._due: dict[int, int] = {}
+
+    def check(self, packet: Packet) -> None:
+        lane, size = packet.lane, self._per_packet
+        if size is not None and (lane % size or packet.lanes != min(size, self._lanes - lane)):
+            raise Rejected("range", f"lanes {lane}…{lane + packet.lanes - 1} are not a packet of this run")
+        due = self._due.get(lane, packet.FIRST_STEP)
+        if packet.step != due:
+            raise Rejected("order", f"step {packet.step}, expected {due}")
+        self._due[lane] = due + 1
 
 
 def _numbered(publish: Publish, encoder: PacketEncoder) -> Send:

@@ -26,12 +26,13 @@ class Setup:
     @cached_property
     def sizes(self) -> Sizes:
         s = self.scenario
-        return Sizes(n=s.system.n, p=s.system.p, q=s.system.q, lanes=s.lanes, steps=s.steps)
+        per_packet = min(s.transport.lanes_per_packet or s.lanes, s.lanes)
+        return Sizes(s.system.n, s.system.p, s.system.q, s.lanes, s.steps, per_packet)
 
     @cached_property
     def blocks(self) -> tuple[tuple[int, int], ...]:
         """(first lane, number of lanes) of each packet of a step."""
-        lanes, size = self.scenario.lanes, self.scenario.transport.lanes_per_packet or self.scenario.lanes
+        lanes, size = self.scenario.lanes, self.sizes.lanes_per_packet or self.scenario.lanes
         return tuple((lane, min(size, lanes - lane)) for lane in range(0, lanes, size))
 
     @property
