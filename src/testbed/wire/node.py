@@ -79,7 +79,7 @@ class Node:
         """
         sizes = self.sizes if last is None else replace(self.sizes, steps=last)
         decoder, turns = Decoder(model, self.run, sizes), _Turns(None if cut else sizes.lanes_per_packet, sizes.lanes)
-        expected = 0
+        expected, required = 0, set(needs)
 
         def receive(_: str, payload: bytes) -> None:
             nonlocal expected
@@ -89,14 +89,14 @@ class Node:
                     raise Rejected("source", f"from {header.source}, expected {source}")
                 if header.seq != expected:
                     raise Rejected("sequence", f"number {header.seq}, expected {expected}")
-                expected += 1
+                if needs and not arrays.keys() >= required:
+                    raise Rejected("arrays", f"lacks one of {', '.join(needs)}")
                 if isinstance(header, Packet):
                     turns.check(header)
-                    if needs and not arrays.keys() >= set(needs):
-                        raise Rejected("arrays", f"lacks one of {', '.join(needs)}")
             except Rejected as refusal:
                 self.rejected[refusal.reason] += 1
                 return
+            expected += 1
             handler(header, arrays)
 
         self.bus.subscribe(key, receive)
