@@ -20,7 +20,7 @@ class MemoryNetwork:
         self._order: deque[MemoryBus] = deque()
         self._subscribers: list[tuple[str, MemoryBus, Handler]] = []
         self._routes: dict[str, list[tuple[MemoryBus, Handler]]] = {}
-        self._answers: dict[str, Answer] = {}
+        self._answers: dict[str, tuple[MemoryBus, Answer]] = {}
         self._tokens: list[tuple[MemoryBus, str]] = []
         self._watchers: list[tuple[str, MemoryBus, PresenceHandler]] = []
 
@@ -68,6 +68,7 @@ class MemoryNetwork:
     def _leave(self, leaving: MemoryBus) -> None:
         self._subscribers = [s for s in self._subscribers if s[1] is not leaving]
         self._watchers = [w for w in self._watchers if w[1] is not leaving]
+        self._answers = {key: answer for key, answer in self._answers.items() if answer[0] is not leaving}
         self._routes.clear()
         self._order = deque(bus for bus in self._order if bus is not leaving)
         gone = [key for bus, key in self._tokens if bus is leaving]
@@ -96,10 +97,10 @@ class MemoryBus:
         answer = self._network._answers.get(key)
         if answer is None:
             raise BusError(f"nobody answers on {key}")
-        return answer(question)
+        return answer[1](question)
 
     def answer(self, key: str, answer: Answer) -> None:
-        self._network._answers[key] = answer
+        self._network._answers[key] = (self, answer)
 
     def announce(self, key: str) -> None:
         self._network._tokens.append((self, key))
