@@ -26,10 +26,7 @@ docs: $(VENV)/.installed-docs
 	@echo "Open the pages in a browser: file://$(CURDIR)/docs/_build/html/index.html"
 
 bench: $(VENV)/.installed-dev
-	@for script in benchmarks/bench_*.py; do \
-	    [ -e "$$script" ] || { echo "there is no benchmarks/bench_*.py"; exit 1; }; \
-	    echo "$$script"; $(BIN)/python "$$script" || exit 1; \
-	done
+	@$(BIN)/python -m benchmarks
 
 clean:
 	rm -rf $(VENV) build dist runs docs/_build .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,0 +1,107 @@
+"""The blocks of the documentation do what the pages say."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import shlex
+import shutil
+import signal
+import subprocess
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from docs.blocks import PAGES, ROOT, Block, blocks_of, matches
+from testbed.cli.main import run_command
+from testbed.scenario import parse_scenario
+
+SMALLEST = """
+[system]
+A = [[1.0]]
+C = [[1.0]]
+Q = [[1.0]]
+R = [[1.0]]
+"""
+RUNNABLE = [page for page in PAGES if any(b.directive.startswith(("run", "file", "part")) for b in blocks_of(page))]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty folder with the scenarios, a terminal of 80 columns, and signal handlers as they were."""
+    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield tmp_path
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("page", RUNNABLE, ids=lambda page: page.stem)
+def test_blocks_run_as_shown(page: Path) -> None:
+    namespace: dict[str, Any] = {"__name__": page.stem}
+    printed = ""
+    for block in blocks_of(page):
+        where = f"{page.name}:{block.line}"
+        verb, _, rest = block.directive.partition(" ")
+        if verb == "file:":
+            Path(rest).write_text(block.text)
+            if "[system]" in block.text:
+                parse_scenario(block.text, source=where)
+        elif verb == "part:":
+            parse_scenario(SMALLEST + block.text, source=where)
+        elif verb == "run" and block.language == "python":
+            printed = run_python(block, namespace, where)
+        elif verb == "run":
+            run_console(block, int(rest.removeprefix("exit ") or 0), where)
+        elif verb == "output":
+            assert matches(block.text, printed), f"{where}: printed\n{printed}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_blocks_are_what_they_say(page: Path) -> None:
+    for block in blocks_of(page):
+        where = f"{page.name}:{block.line}"
+        if block.language == "toml":
+            tomllib.loads(block.text)
+        if block.directive.startswith("same as: "):
+            other = ROOT / block.directive.removeprefix("same as: ")
+            assert block.text in other.read_text(encoding="utf-8"), f"{where} differs from {other.name}"
+        known = ("", "run", "file:", "part:", "output", "same")
+        assert block.directive.partition(" ")[0] in known, f"{where}: unknown {block.directive!r}"
+
+
+def run_python(block: Block, namespace: dict[str, Any], where: str) -> str:
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        exec(compile(block.text, where, "exec"), namespace)
+    return out.getvalue()
+
+
+def run_console(block: Block, last_code: int, where: str) -> None:
+    """Run the lines that begin with "$"; what stands below each is its output."""
+    commands = block.text.split("$ ")[1:]
+    for number, text in enumerate(commands, 1):
+        command, _, shown = text.partition("\n")
+        code, output = execute(command)
+        assert code == (last_code if number == len(commands) else 0), f"{where}: {command}: exit code {code}\n{output}"
+        assert matches(shown, output), f"{where}: {command}: printed\n{output}"
+
+
+def execute(command: str) -> tuple[int, str]:
+    """Exit code and output of a command; those of the testbed run in this process, runs on the in-process bus."""
+    words = shlex.split(command)
+    if words[0] != "testbed":
+        done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=20, check=False)
+        return done.returncode, done.stdout + done.stderr
+    arguments = words[1:]
+    if arguments[0] == "run" and not {"--external", "--in-process"} & set(arguments):
+        arguments.append("--in-process")
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+        code = run_command(arguments)
+    return code, output.getvalue()
