@@ -5,6 +5,8 @@ For i.i.d. control losses it is the same estimator as GPB1 and IMM.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any
 
 from numpy.typing import NDArray
@@ -14,6 +16,9 @@ from testbed.estimator.riccati import Gain, log_odds, phi, predict
 from testbed.numerics.lanes import (
     Component,
     Floats,
+    Mask,
+    Matrix,
+    Vector,
     add,
     add_outer,
     any_of,
@@ -22,12 +27,14 @@ from testbed.numerics.lanes import (
     exp,
     full,
     mask_of,
+    one_lane,
     scale,
     subtract,
     vector_of,
     where,
     where_vector,
 )
+from testbed.numerics.symbols import Shape
 
 _Weights = tuple[Component, Component]
 """Posterior of ν = 0 and of ν = 1, each kept to full relative accuracy."""
@@ -45,24 +52,12 @@ class Aoe:
 
     def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
         """An ACK of ν_{k−1} decides between the hypotheses; older ones come too late and are counted."""
-        model, gamma = self._model, mask_of(arrived)
+        gamma = mask_of(arrived)
         self._k += 1
+        advance = _one_lane(self._model, gamma) if isinstance(gamma, bool) else partial(_advance, self._model, gamma)
         weights = self._prior_weights(acks)
-        idle = constant_times(model.a, self._x)
-        shift = model.control_effect(vector_of(u)) if model.q else [0.0] * model.n
-        covariance = predict(model.a, self._p, model.noise)
-        gain = Gain(covariance, model.c, model.sensor_noise)
-        if any_of(gamma):
-            innovation = subtract(vector_of(y), constant_times(model.c, idle))
-            updated = _bayes(weights, log_odds(gain, shift, innovation))
-            weights = where(gamma, updated[0], weights[0]), where(gamma, updated[1], weights[1])
-            idle, shift = (
-                where_vector(gamma, gain.correct(idle, vector_of(y)), idle),
-                where_vector(gamma, gain.propagate(shift), shift),
-            )
-        self._posterior = weights
-        self._x = add(idle, scale(weights[1], shift))
-        self._p = add_outer(phi(covariance, gain, gamma), weights[0] * weights[1], shift)
+        self._x, self._p, *posterior = advance(self._x, self._p, *weights, vector_of(u), vector_of(y))
+        self._posterior = posterior[0], posterior[1]
         return Estimate(self._x, self._p, self._lanes)
 
     def _prior_weights(self, acks: tuple[Ack, ...]) -> _Weights:
@@ -79,6 +74,32 @@ class Aoe:
         if ack is None:
             return weights
         return where(ack[0], 1.0 - ack[1], weights[0]), where(ack[0], ack[1], weights[1])
+
+
+def _advance(
+    model: Model, gamma: Mask, x: Vector, P: Matrix, lost: Component, delivered: Component, u: Vector, y: Vector
+) -> tuple[Vector, Matrix, Component, Component]:
+    """One step from x̂, P and the prior weights of ν = 0 and ν = 1 to x̂, P and the posterior ones."""
+    idle = constant_times(model.a, x)
+    shift = model.control_effect(u) if model.q else [0.0] * model.n
+    covariance = predict(model.a, P, model.noise)
+    gain = Gain(covariance, model.c, model.sensor_noise)
+    if any_of(gamma):
+        innovation = subtract(y, constant_times(model.c, idle))
+        updated = _bayes((lost, delivered), log_odds(gain, shift, innovation))
+        lost, delivered = where(gamma, updated[0], lost), where(gamma, updated[1], delivered)
+        idle, shift = (
+            where_vector(gamma, gain.correct(idle, y), idle),
+            where_vector(gamma, gain.propagate(shift), shift),
+        )
+    merged = add_outer(phi(covariance, gain, gamma), lost * delivered, shift)
+    return add(idle, scale(delivered, shift)), merged, lost, delivered
+
+
+@lru_cache(maxsize=16)
+def _one_lane(model: Model, gamma: bool) -> Callable[..., tuple[Any, ...]]:
+    state: tuple[Shape, ...] = (("vector", model.n), ("symmetric", model.n), ("scalar", 1), ("scalar", 1))
+    return one_lane(partial(_advance, model, gamma), (*state, ("vector", model.q), ("vector", model.p)), state)
 
 
 def _bayes(weights: _Weights, odds: Component) -> _Weights:

@@ -23,25 +23,34 @@ _FEW = 32  # up to here adding one by one is faster
 def exact_parts(x: Floats) -> list[float]:
     """A few doubles whose exact sum is that of the finite array x of shape (M,), |x| < 1e300."""
     parts: list[float] = []
-    rest = x
-    bits = math.ceil(math.log2(len(x) + 2)) if len(x) else 0
-    while True:
-        peak = float(np.abs(rest).max(initial=0.0))
-        if peak == 0.0:
-            return parts
-        sigma = math.ldexp(1.0, math.frexp(peak)[1] + bits)
-        high = (sigma + rest) - sigma
+    if not len(x):
+        return parts
+    bits = math.ceil(math.log2(len(x) + 2))
+    rest, high = x, np.empty_like(x)
+    top = max(float(x.max()), -float(x.min()))
+    while top != 0.0:
+        sigma = math.ldexp(1.0, math.frexp(top)[1] + bits)
+        np.add(rest, sigma, out=high)
+        high -= sigma
         parts.append(float(high.sum()))
-        rest = rest - high
+        rest = np.subtract(rest, high, out=None if rest is x else rest)
+        top = sigma * 2.0**-53 if rest.any() else 0.0
+    return parts
 
 
 def square(x: Component) -> tuple[Component, Component]:
     """x² = hi + lo without error (Dekker), for 1e-146 < |x| < 1e150; elementwise."""
-    t = _SPLITTER * x
-    head = t - (t - x)
+    head = _SPLITTER * x
+    head = head - (head - x)
     tail = x - head
     hi = x * x
-    lo = ((head * head - hi) + 2.0 * (head * tail)) + tail * tail
+    lo = head * head
+    lo -= hi
+    head *= tail
+    head *= 2.0
+    lo += head
+    tail *= tail
+    lo += tail
     return hi, lo
 
 

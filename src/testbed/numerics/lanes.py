@@ -12,11 +12,15 @@ Constant matrices (the same for all lanes) are tuples of tuples of ``float``; th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
+
+from testbed.numerics.symbols import Shape, Symbol, straight_line
+
+_STRAIGHT_MAX = 8  # order of the largest matrix for which code is written out
 
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -196,24 +200,42 @@ def trace(p: Matrix) -> Component:
 def sqrt(x: Component) -> Component:
     if isinstance(x, float):
         return math.sqrt(x) if x >= 0.0 else math.nan
+    if isinstance(x, Symbol):
+        return x.apply("sqrt")
     return np.sqrt(x)
 
 
 def reciprocal(x: Component) -> Component:
     if isinstance(x, float):
         return 1.0 / x if x != 0.0 else math.copysign(math.inf, x)
+    if isinstance(x, Symbol):
+        return x.apply("reciprocal")
     return 1.0 / x
 
 
 def exp(x: Component) -> Component:
     """exp by numpy in both forms: ``math.exp`` differs from it in the last bit."""
-    return float(np.exp(x)) if isinstance(x, float) else np.exp(x)
+    if isinstance(x, float):
+        return float(np.exp(x))
+    return x.apply("exp") if isinstance(x, Symbol) else np.exp(x)
 
 
 def clip(x: Component, low: float, high: float) -> Component:
     if isinstance(x, float):
         return min(max(x, low), high)
+    if isinstance(x, Symbol):
+        return x.apply("clip", low, high)
     return np.minimum(np.maximum(x, low), high)
+
+
+def one_lane(
+    function: Callable[..., Sequence[Any]], arguments: Sequence[Shape], results: Sequence[Shape]
+) -> Callable[..., tuple[Any, ...]]:
+    """``function`` as straight-line code for one lane, to the same bits; itself where it is too long for that."""
+    if max(n for _, n in arguments) > _STRAIGHT_MAX:
+        return cast(Callable[..., tuple[Any, ...]], function)
+    calls: dict[str, Callable[..., Any]] = {"sqrt": sqrt, "reciprocal": reciprocal, "exp": exp, "clip": clip}
+    return straight_line(function, arguments, results, calls)
 
 
 class Cholesky:

@@ -52,6 +52,7 @@ class Conductor:
         self._roles = roles
         self._present: set[str] = set()
         self._granted = 0
+        self._steps, self._window = setup.scenario.steps, setup.window
         self._stopping = False
         self._recorder = recorder
         self.node = Node(bus, setup.run, ORCHESTRATOR, setup.sizes)
@@ -168,7 +169,7 @@ class Conductor:
 
     def _advance(self) -> None:
         """Grant the steps that the window allows, several at a time."""
-        steps, window = self.setup.scenario.steps, self.setup.window
+        steps, window = self._steps, self._window
         target = min(steps, self.collector.completed + window)
         if target > self._granted and (target == steps or target - self._granted >= max(1, window // 4)):
             self._granted = target

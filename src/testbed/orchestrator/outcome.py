@@ -85,8 +85,9 @@ def moment_checks(scenario: Scenario) -> list[Check]:
     A, chain = np.array(scenario.system.A), chain_of(scenario.links.observation.loss)
     order, rho = finite_moment_order(A, chain), spectral_radius(A)
     where = f"ρ(A) = {rho:.6g}, P(arrival after a loss) = {chain.recovery:.6g}"
-    mean = f"ρ²(1 − recovery) = {rho**2 * (1 - chain.recovery):.4g}"
-    variance = f"ρ⁴(1 − recovery) = {rho**4 * (1 - chain.recovery):.4g}"
+    growth = rho * rho  # a power would raise where this is infinite
+    mean = f"ρ²(1 − recovery) = {growth * (1 - chain.recovery):.4g}"
+    variance = f"ρ⁴(1 − recovery) = {growth * growth * (1 - chain.recovery):.4g}"
     if order <= 1.0:
         return [Check(name="finite mean", ok=False, text=f"{where}: {mean} ≥ 1, the EEC diverges")]
     checks = [Check(name="finite mean", ok=True, text=f"{where}: {mean} < 1, necessary for a bounded EEC")]

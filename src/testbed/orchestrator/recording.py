@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ def read_recording(path: Path) -> Iterator[tuple[str, Packet, _Arrays]]:
     """
     with path.open("rb") as file:
         try:
-            reader = make_reader(file)
+            reader = make_reader(file, validate_crcs=True)
             scenario = next((m.metadata["scenario"] for m in reader.iter_metadata() if m.name == "run"), None)
             if scenario is None:
                 raise UsageError(f"{path}: not the recording of a run")
@@ -39,10 +40,11 @@ def read_recording(path: Path) -> Iterator[tuple[str, Packet, _Arrays]]:
                     sizes = Setup(run, parse_scenario(scenario)).sizes
                     decoders[kind] = Decoder(MESSAGES[kind], run, sizes)
                 header, arrays = decoders[kind].decode(message.data)
-                assert isinstance(header, Packet)
+                if not isinstance(header, Packet):
+                    raise Rejected("schema", f"a {kind} in a recording")
                 yield channel.topic, header, arrays
-        except (McapError, Rejected, KeyError, ValueError) as error:
-            raise UsageError(f"{path}: not a whole recording: {error}") from None
+        except (McapError, Rejected, struct.error, OSError, KeyError, TypeError, ValueError) as error:
+            raise UsageError(f"{path}: not a whole recording: {' '.join(str(error).split())}") from None
 
 
 def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[str]:
@@ -57,7 +59,7 @@ def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[s
         if not 0 <= row < packet.lanes:
             continue
         if topic == "control/sent":
-            steps.setdefault(packet.step + 1, {})["u"] = arrays["u"][row].tolist()
+            steps.setdefault(packet.step + 1, {})["u"] = arrays["u"][row].tolist() if "u" in arrays else None
         elif topic == "observation/delivered":
             arrived = bool(arrays["mask"][row])
             steps.setdefault(packet.step, {})["y"] = arrays["y"][row].tolist() if arrived else None

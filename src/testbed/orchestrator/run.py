@@ -117,10 +117,10 @@ class Run:
             conductor.fail(str(error))
         try:
             conductor.stop()
-            network.run(lambda: all(node.stopped for node, _ in nodes))
+            _drain(network, lambda: all(node.stopped for node, _ in nodes))
             for node, role in nodes:
                 node.report("stopped", role.counters)
-            network.run(lambda: conductor.all_reported)
+            _drain(network, lambda: conductor.all_reported)
             return self._finish(conductor, interrupted=interrupted)
         finally:
             if recorder is not None:
@@ -148,17 +148,22 @@ class Run:
     def _drive(self, conductor: Conductor, bus: object, supervisor: Supervisor, *, patient: bool) -> None:
         """Until the run is over, has failed, or made no progress for the deadline."""
         deadline_s = self._setup.scenario.transport.deadline_ns / 1e9
-        last, since = -1, time.monotonic()
+        last, since, looked = -1, time.monotonic(), 0.0
         while not conductor.over:
             bus.run(_POLL_S)  # type: ignore[attr-defined]
+            now = time.monotonic()
+            if now - looked < _POLL_S:
+                continue
+            looked = now
             self._tell(conductor)
             for role, ending in supervisor.dead().items():
                 if role not in conductor.reports:
                     conductor.fail(f"{role} ended: {ending}{_last_words(supervisor.log_of(role))}")
             if conductor.activity != last:
-                last, since = conductor.activity, time.monotonic()
-            elif time.monotonic() - since > deadline_s and not (patient and not conductor.started):
+                last, since = conductor.activity, now
+            elif now - since > deadline_s and not (patient and not conductor.started):
                 conductor.fail(f"no progress for {deadline_s:g} s; waiting for {conductor.awaiting()}")
+        self._tell(conductor)
         if conductor.failure is not None and conductor.failure.endswith(" is gone"):
             role = conductor.failure.removesuffix(" is gone")
             if (how := supervisor.ending_of(role)) is not None:
@@ -201,6 +206,16 @@ class Run:
         summary = summarise(conductor, status=status, reason=reason, timing=timing)
         write_results(self._out, summary, self._setup.scenario)
         return summary
+
+
+def _drain(network: MemoryNetwork, until: Callable[[], bool]) -> None:
+    """Deliver what is left; a role that has failed may fail again at each message that still waits for it."""
+    while not until():
+        try:
+            if not network.step():
+                return
+        except TestbedError:
+            continue
 
 
 def write_results(out: Path, summary: Summary, scenario: Scenario) -> None:

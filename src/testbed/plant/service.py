@@ -26,7 +26,7 @@ class PlantService:
         self._plants = {lane: Plant(setup.scenario, lane, lanes) for lane, lanes in setup.blocks}
         self._next = dict.fromkeys(self._plants, 0)
         self._truth = node.sender(keys.truth, Truth)
-        self._ack = node.sender(keys.sent("ack"), Acknowledgement, tap=True)
+        self._ack = node.sender(keys.sent("ack"), Acknowledgement, tap=True) if setup.acks_are_of_use else None
         self._observe = node.sender(keys.sent("observation"), Observation, tap=True)
         self.counters: dict[str, int] = {}
         node.on(keys.delivered("control"), Control, "link.control", self._move, needs=("mask",))
@@ -39,6 +39,7 @@ class PlantService:
         if not (all_finite(x.ravel()) and all_finite(y.ravel())):
             raise RunFailed(f"the state left the range of floating-point numbers at step {step}")
         nu = bits(applied)
-        self._ack(step, lane, lanes, {"nu": nu})
+        if self._ack is not None:
+            self._ack(step, lane, lanes, {"nu": nu})
         self._truth(step, lane, lanes, {"x": x, "nu": nu})
         self._observe(step, lane, lanes, {"y": y})

@@ -24,7 +24,7 @@ class Bus(Protocol):
     """Handlers run on the thread that calls ``run``, one at a time, in the order of arrival."""
 
     def publisher(self, key: str) -> Publish:
-        """A function that publishes on ``key``. Order is kept over all keys of one bus; nothing is lost."""
+        """A function that publishes on ``key``. Order is kept on each key; nothing is lost."""
         ...
 
     def subscribe(self, key: str, handler: Handler) -> None:

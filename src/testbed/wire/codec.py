@@ -20,7 +20,11 @@ from testbed.wire.messages import PROTOCOL, ArrayEntry, Message, Packet
 
 MAGIC = b"NCS1"
 MAX_HEADER = 1 << 16
-_DTYPES: dict[str, np.dtype[Any]] = {"<f8": np.dtype("<f8"), "|u1": np.dtype("u1")}
+_FLOAT = np.dtype("<f8")
+_DTYPES: dict[str, np.dtype[Any]] = {"<f8": _FLOAT, "|u1": np.dtype("u1")}
+_LAYOUTS_MAX = 64
+_SMALL = 1024  # bytes up to which copying an array twice costs less than a view of it
+_BLANKS = tuple(b" " * n for n in range(8))
 _PADDING = (b"", b"\0" * 7, b"\0" * 6, b"\0" * 5, b"\0" * 4, b"\0" * 3, b"\0" * 2, b"\0")
 
 M = TypeVar("M", bound=Message)
@@ -66,30 +70,47 @@ class PacketEncoder:
         kind = model.model_fields["type"].default
         model.model_validate({"type": kind, "run": run, "source": source, "seq": 0, "step": 0, "lane": 0, "lanes": 1})
         self._head = f'{{"v":{PROTOCOL},"type":"{kind}","run":"{run}","source":"{source}","seq":'
-        self._lists: dict[tuple[tuple[str, tuple[int, ...]], ...], str] = {}
+        self._tails: dict[tuple[tuple[str, tuple[int, ...]], ...], str] = {}
 
     def encode(self, seq: int, step: int, lane: int, lanes: int, arrays: Arrays) -> bytes:
         """The payload of one packet; arrays: float64 or uint8."""
-        shapes = tuple((name, array.shape) for name, array in arrays.items())
-        listed = self._lists.get(shapes)
-        if listed is None:
-            listed = self._lists[shapes] = json.dumps(entries_of(arrays), separators=(",", ":"))
-        header = f'{self._head}{seq},"step":{step},"lane":{lane},"lanes":{lanes},"arrays":{listed}}}'
-        return _joined(header.encode(), arrays)
+        shapes = tuple([(name, array.shape) for name, array in arrays.items()])
+        tail = self._tails.get(shapes)
+        if tail is None:
+            listed = json.dumps(entries_of(arrays), separators=(",", ":"))
+            tail = self._tails[shapes] = f',"arrays":{listed}}}'
+        return _joined(f'{self._head}{seq},"step":{step},"lane":{lane},"lanes":{lanes}{tail}'.encode(), arrays)
 
 
 def _joined(header: bytes, arrays: Arrays) -> bytes:
-    pieces: list[bytes | memoryview] = [
-        MAGIC,
-        (len(header) + -len(header) % 8).to_bytes(4, "little"),
-        header,
-        b" " * (-len(header) % 8),
-    ]
+    blanks = -len(header) % 8
+    pieces: list[bytes | memoryview] = [MAGIC, (len(header) + blanks).to_bytes(4, "little"), header, _BLANKS[blanks]]
     for array in arrays.values():
-        pieces.append(array.data if array.flags.c_contiguous and array.size else array.tobytes())
+        content = array.tobytes() if array.nbytes < _SMALL or not array.flags.c_contiguous else array.data
+        pieces.append(content)
         if array.nbytes % 8:
             pieces.append(_PADDING[array.nbytes % 8])
     return b"".join(pieces)
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """One array of a layout; ``offset`` from the end of the header."""
+
+    name: str
+    dtype: np.dtype[Any]
+    count: int
+    shape: tuple[int, ...]
+    offset: int
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """The arrays of a packet and the bytes they take; ``bare_mask``: a mask and nothing else."""
+
+    slots: tuple[_Slot, ...]
+    size: int
+    bare_mask: bool
 
 
 class Decoder(Generic[M]):
@@ -98,6 +119,7 @@ class Decoder(Generic[M]):
     def __init__(self, model: type[M], run: str, sizes: Sizes) -> None:
         self._model, self._run, self._sizes = model, run, sizes
         self._validate = model.__pydantic_validator__.validate_json
+        self._layouts: dict[tuple[tuple[ArrayEntry, ...], int], _Layout] = {}
         self._required = {name for name, rule in model.ARRAYS.items() if rule.required}
 
     def decode(self, payload: bytes) -> tuple[M, dict[str, NDArray[Any]]]:
@@ -129,32 +151,47 @@ class Decoder(Generic[M]):
         return header, self._arrays(header, payload, 8 + length)
 
     def _arrays(self, header: Packet, payload: bytes, offset: int) -> dict[str, NDArray[Any]]:
-        rules, out = self._model.ARRAYS, {}
-        for name, code, shape in header.arrays:
-            rule = rules.get(name)
-            if rule is None or name in out:
-                raise Rejected("arrays", f"array {name!r} not expected")
-            if code != rule.dtype or shape != self._shape(rule.shape, header.lanes):
-                raise Rejected("shape", f"{name} is {code} {shape}, expected {rule.dtype} {rule.shape}")
-            count = math.prod(shape)
-            size = count * (8 if code == "<f8" else 1)
-            if offset + size > len(payload):
-                raise Rejected("format", f"payload of {len(payload)} bytes ends inside {name}")
-            flat = np.frombuffer(payload, _DTYPES[code], count, offset)
-            if code == "<f8":
-                if not all_finite(flat):
-                    raise Rejected("finite", f"{name} holds a value that is not finite")
-            elif count and flat.max() > 1:
-                raise Rejected("mask", f"{name} holds a value other than 0 and 1")
-            out[name] = flat.reshape(shape)
-            offset += size + -size % 8
-        if offset != len(payload):
-            raise Rejected("format", f"payload of {len(payload)} bytes, arrays end at {offset}")
-        if not self._required <= out.keys():
-            raise Rejected("arrays", f"missing {', '.join(sorted(self._required - out.keys()))}")
-        if len(out) == 1 and "mask" in out and out["mask"].any():
+        layout = self._layouts.get((header.arrays, header.lanes))
+        if layout is None:
+            layout = self._layout(header.arrays, header.lanes)
+            if len(self._layouts) < _LAYOUTS_MAX:
+                self._layouts[header.arrays, header.lanes] = layout
+        if len(payload) != offset + layout.size:
+            raise Rejected("format", f"payload of {len(payload)} bytes, its arrays need {offset + layout.size}")
+        out = {}
+        for slot in layout.slots:
+            flat = np.frombuffer(payload, slot.dtype, slot.count, offset + slot.offset)
+            if slot.dtype is _FLOAT:
+                if (
+                    not (math.isfinite(sum(flat.tolist())) or all_finite(flat))
+                    if slot.count < 8
+                    else not all_finite(flat)
+                ):
+                    raise Rejected("finite", f"{slot.name} holds a value that is not finite")
+            elif slot.count and (flat[0] if slot.count == 1 else flat.max()) > 1:
+                raise Rejected("mask", f"{slot.name} holds a value other than 0 and 1")
+            out[slot.name] = flat.reshape(slot.shape)
+        if layout.bare_mask and out["mask"].any():
             raise Rejected("arrays", "the mask says that something arrived and nothing is there")
         return out
+
+    def _layout(self, arrays: tuple[ArrayEntry, ...], lanes: int) -> _Layout:
+        """Where the arrays that a header lists lie. Raises Rejected for a list that the type does not allow."""
+        slots: list[_Slot] = []
+        offset = 0
+        for name, code, shape in arrays:
+            rule = self._model.ARRAYS.get(name)
+            if rule is None or any(slot.name == name for slot in slots):
+                raise Rejected("arrays", f"array {name!r} not expected")
+            if code != rule.dtype or shape != self._shape(rule.shape, lanes):
+                raise Rejected("shape", f"{name} is {code} {shape}, expected {rule.dtype} {rule.shape}")
+            slots.append(_Slot(name, _DTYPES[code], math.prod(shape), shape, offset))
+            size = slots[-1].count * _DTYPES[code].itemsize
+            offset += size + -size % 8
+        names = {slot.name for slot in slots}
+        if not self._required <= names:
+            raise Rejected("arrays", f"missing {', '.join(sorted(self._required - names))}")
+        return _Layout(tuple(slots), offset, names == {"mask"})
 
     def _shape(self, symbols: tuple[str, ...], lanes: int) -> tuple[int, ...]:
         return tuple(lanes if s == "lanes" else getattr(self._sizes, s) for s in symbols)

@@ -187,11 +187,15 @@ def messages_json_schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Messages of a testbed run",
         "description": (
-            "A payload is: the four bytes 'NCS1'; the header's length in bytes as a little-endian uint32; the header, "
+            "A message is: the four bytes 'NCS1'; the header's length in bytes as a little-endian uint32; the header, "
             "JSON in UTF-8 (integers without a decimal point), padded with spaces to a multiple of 8; then the arrays "
             "in the order of 'arrays' (name, dtype, shape), C order, little-endian, each padded with zero bytes to a "
             "multiple of 8. 'x-arrays' says which arrays a type may have; 'lanes' there is the field, n, p, q are the "
             "sizes of the state, the observation and the input."
+        ),
+        "x-bundle": (
+            "A payload is one message, or several: the four bytes 'NCSB'; their number as a little-endian uint32; then "
+            "each message behind its length in bytes as a little-endian uint64."
         ),
         "oneOf": [{"$ref": f"#/$defs/{name}"} for name in definitions],
         "$defs": definitions,

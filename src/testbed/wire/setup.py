@@ -39,7 +39,7 @@ class Setup:
     def closed_loop(self) -> bool:
         return isinstance(self.scenario.input, FeedbackInput)
 
-    @property
+    @cached_property
     def window(self) -> int:
         """Steps in flight at most: 1 in a closed loop; else the scenario's, or as many as fit into a few megabytes."""
         if self.closed_loop:
@@ -54,6 +54,12 @@ class Setup:
     def tap(self) -> int:
         """Lanes whose packets are recorded."""
         return {"none": 0, "first": 1, "all": self.scenario.lanes}[self.scenario.record]
+
+    @property
+    def acks_are_of_use(self) -> bool:
+        """Whether anybody takes the plant's ACKs: an ack link, an estimator that gets them directly, the recording."""
+        s = self.scenario
+        return s.links.ack.mode != "none" or s.record != "none" or any(e.acks == "perfect" for e in s.estimators)
 
     def to_json(self) -> bytes:
         return json.dumps({"run": self.run, "scenario": to_toml(self.scenario)}).encode()

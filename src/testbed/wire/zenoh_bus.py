@@ -9,14 +9,23 @@ from typing import Any
 
 import zenoh
 
+from testbed.wire.bundle import bundle, unbundle
 from testbed.wire.bus import Answer, BusError, Handler, PresenceHandler, Publish
 
 INBOX_MAX = 65536
 """Messages waiting in a process beyond which its receiving thread pauses, and zenoh holds back the senders."""
 
 
+_AT_ONCE = 256  # events handled before what they gave rise to is sent
+_BUNDLE_MAX = 64  # messages
+_SMALL = 16_384  # bytes; a larger message does not wait
+
+
 class ZenohBus:
     """Publishes reliably and blocking; hands every event to the thread that calls ``run``.
+
+    Small messages that come out of events handled in one go leave in one payload for each key, so that order is kept
+    on each key but not between keys.
 
     express: send each message at once instead of batching; right when only one is in flight.
     """
@@ -25,6 +34,8 @@ class ZenohBus:
         self._session, self._deadline_s, self.express = session, deadline_s, express
         self._inbox: queue.SimpleQueue[tuple[Callable[..., None], Any]] = queue.SimpleQueue()
         self._declared: list[Any] = []
+        self._outbox: dict[Publish, list[bytes]] = {}
+        self._handling = False
 
     def run(self, timeout_s: float) -> bool:
         """Handle what has arrived, waiting up to ``timeout_s`` for the first; False if nothing came."""
@@ -32,10 +43,15 @@ class ZenohBus:
             handle, event = self._inbox.get(timeout=timeout_s)
         except queue.Empty:
             return False
-        handle(event)
-        for _ in range(min(self._inbox.qsize(), 1000)):
-            handle, event = self._inbox.get_nowait()
+        self._handling = True
+        try:
             handle(event)
+            for _ in range(min(self._inbox.qsize(), _AT_ONCE)):
+                handle, event = self._inbox.get_nowait()
+                handle(event)
+        finally:
+            self._handling = False
+            self._flush()
         return True
 
     def publisher(self, key: str) -> Publish:
@@ -47,17 +63,27 @@ class ZenohBus:
         )
         self._declared.append(publisher)
         put: Publish = publisher.put
-        return put
+        waiting: list[bytes] = []
+        self._outbox[put] = waiting
+
+        def publish(payload: bytes) -> None:
+            if not self._handling:
+                put(payload)
+                return
+            waiting.append(payload)
+            if len(waiting) >= _BUNDLE_MAX or len(payload) > _SMALL:
+                put(bundle(waiting))
+                waiting.clear()
+
+        return publish
 
     def subscribe(self, key: str, handler: Handler) -> None:
         def handle(sample: Any) -> None:
-            handler(str(sample.key_expr), sample.payload.to_bytes())
+            name = str(sample.key_expr) if "*" in key else key
+            for message in unbundle(sample.payload.to_bytes()):
+                handler(name, message)
 
-        def handle_fixed(sample: Any) -> None:
-            handler(key, sample.payload.to_bytes())
-
-        one = handle if "*" in key else handle_fixed
-        self._declared.append(self._session.declare_subscriber(key, self._into_inbox(one)))
+        self._declared.append(self._session.declare_subscriber(key, self._into_inbox(handle)))
 
     def ask(self, key: str, question: bytes = b"") -> bytes:
         replies = self._session.get(key, payload=question, timeout=self._deadline_s)
@@ -86,6 +112,12 @@ class ZenohBus:
 
     def close(self) -> None:
         self._session.close()  # type: ignore[no-untyped-call]
+
+    def _flush(self) -> None:
+        for put, waiting in self._outbox.items():
+            if waiting:
+                put(bundle(waiting))
+                waiting.clear()
 
     def _into_inbox(self, handle: Callable[..., None]) -> Any:
         inbox = self._inbox
