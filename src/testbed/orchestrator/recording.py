@@ -37,7 +37,7 @@ def read_recording(path: Path) -> Iterator[tuple[str, Packet, _Arrays]]:
                 kind = schema.name if schema is not None else ""
                 if kind not in decoders:
                     run = json.loads(message.data[8 : 8 + int.from_bytes(message.data[4:8], "little")])["run"]
-                    sizes = Setup(run, parse_scenario(scenario)).sizes
+                    sizes = Setup(run, parse_scenario(scenario, source=f"{path}: scenario")).sizes
                     decoders[kind] = Decoder(MESSAGES[kind], run, sizes)
                 header, arrays = decoders[kind].decode(message.data)
                 if not isinstance(header, Packet):
@@ -59,7 +59,7 @@ def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[s
         if not 0 <= row < packet.lanes:
             continue
         if topic == "control/sent":
-            steps.setdefault(packet.step + 1, {})["u"] = arrays["u"][row].tolist() if "u" in arrays else None
+            steps.setdefault(packet.step + 1, {})["u"] = arrays["u"][row].tolist()
         elif topic == "observation/delivered":
             arrived = bool(arrays["mask"][row])
             steps.setdefault(packet.step, {})["y"] = arrays["y"][row].tolist() if arrived else None
@@ -68,6 +68,8 @@ def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[s
     if not steps:
         raise UsageError(f"{path}: lane {lane} was not recorded; see `record` in the scenario")
     whole = [k for k, parts in steps.items() if "u" in parts and "y" in parts]
+    if not whole:
+        raise UsageError(f"{path}: holds no whole step of lane {lane}")
     return [
         json.dumps({"k": k, "u": steps[k]["u"], "y": steps[k]["y"], "acks": steps[k].get("acks", [])})
         for k in sorted(whole)
