@@ -9,6 +9,8 @@ is enough for the best estimator; that is the *correlated* upper bound here.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any
 
 from numpy.typing import NDArray
@@ -16,7 +18,8 @@ from numpy.typing import NDArray
 from testbed.channel.loss import Chain
 from testbed.estimator.model import Model
 from testbed.estimator.riccati import Gain, phi, predict
-from testbed.numerics.lanes import Floats, Matrix, constant, mask_of, matrices_of
+from testbed.numerics.lanes import Constant, Floats, Mask, Matrix, constant, mask_of, matrices_of, one_lane
+from testbed.numerics.symbols import Shape
 
 
 def correlation_factor(control: Chain) -> float | None:
@@ -46,6 +49,20 @@ class Bounds:
             self._upper = self._next(self._upper, self._upper_noise, gamma)
         return self._lower, self._upper
 
-    def _next(self, p: Matrix, noise: Any, gamma: Any) -> Matrix:
-        covariance = predict(self._model.a, p, noise)
-        return phi(covariance, Gain(covariance, self._model.c, self._model.sensor_noise), gamma)
+    def _next(self, P: Matrix, noise: Constant, gamma: Mask) -> Matrix:
+        if not isinstance(gamma, bool):
+            return _advance(self._model, noise, gamma, P)[0]
+        advanced: Matrix = _one_lane(self._model, noise, gamma)(P)[0]
+        return advanced
+
+
+def _advance(model: Model, noise: Constant, gamma: Mask, P: Matrix) -> tuple[Matrix]:
+    """One step of a covariance: φ(A P A' + noise, γ)."""
+    covariance = predict(model.a, P, noise)
+    return (phi(covariance, Gain(covariance, model.c, model.sensor_noise), gamma),)
+
+
+@lru_cache(maxsize=16)
+def _one_lane(model: Model, noise: Constant, gamma: bool) -> Callable[..., tuple[Matrix]]:
+    shape: tuple[Shape, ...] = (("symmetric", model.n),)
+    return one_lane(partial(_advance, model, noise, gamma), shape, shape)

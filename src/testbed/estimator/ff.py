@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any
 
 from numpy.typing import NDArray
@@ -12,17 +14,22 @@ from testbed.estimator.riccati import Gain, phi, predict
 from testbed.numerics.lanes import (
     Component,
     Floats,
+    Mask,
+    Matrix,
+    Vector,
     add,
     add_outer,
     any_of,
     constant_times,
     mask_of,
+    one_lane,
     scale,
     vector_of,
     where,
     where_symmetric,
     where_vector,
 )
+from testbed.numerics.symbols import Shape
 
 
 class Ff:
@@ -44,23 +51,37 @@ class Ff:
         """Older ACKs than that of ν_{k−1} cannot be used and are counted."""
         model, gamma = self._model, mask_of(arrived)
         self._k += 1
-        rate = self._rate(acks)
-        mean = constant_times(model.a, self._x)
-        covariance = predict(model.a, self._p, model.noise)
-        if model.q:
-            push = model.control_effect(vector_of(u))
-            mean = add(mean, scale(rate, push))
-            covariance = add_outer(covariance, rate * (1.0 - rate), push)
-        ack_covariance = predict(model.a, self._ack_p, model.noise)
-        gain = Gain(ack_covariance, model.c, model.sensor_noise)
-        self._ack_p = phi(ack_covariance, gain, gamma)
-        self._x, self._p = mean, covariance
-        if any_of(gamma):
-            self._x = where_vector(gamma, gain.correct(mean, vector_of(y)), mean)
-            self._p = where_symmetric(gamma, gain.joseph(covariance), covariance)
+        advance = _one_lane(model, gamma) if isinstance(gamma, bool) else partial(_advance, model, gamma)
+        given = self._rate(acks), vector_of(u), vector_of(y)
+        self._x, self._p, self._ack_p = advance(self._x, self._p, self._ack_p, *given)
         return Estimate(self._x, self._p, self._lanes)
 
     def _rate(self, acks: tuple[Ack, ...]) -> Component:
         ack = newest_ack(acks, self._k - 1, self.counters)
         rate = self._model.control.start
         return rate if ack is None else where(ack[0], ack[1], rate)
+
+
+def _advance(
+    model: Model, gamma: Mask, x: Vector, P: Matrix, ack_P: Matrix, rate: Component, u: Vector, y: Vector
+) -> tuple[Vector, Matrix, Matrix]:
+    """One step from x̃, P̃ and Pᴬ, with P(ν = 1) = rate."""
+    mean = constant_times(model.a, x)
+    covariance = predict(model.a, P, model.noise)
+    if model.q:
+        push = model.control_effect(u)
+        mean = add(mean, scale(rate, push))
+        covariance = add_outer(covariance, rate * (1.0 - rate), push)
+    ack_covariance = predict(model.a, ack_P, model.noise)
+    gain = Gain(ack_covariance, model.c, model.sensor_noise)
+    if any_of(gamma):
+        mean = where_vector(gamma, gain.correct(mean, y), mean)
+        covariance = where_symmetric(gamma, gain.joseph(covariance), covariance)
+    return mean, covariance, phi(ack_covariance, gain, gamma)
+
+
+@lru_cache(maxsize=16)
+def _one_lane(model: Model, gamma: bool) -> Callable[..., tuple[Any, ...]]:
+    state: tuple[Shape, ...] = (("vector", model.n), ("symmetric", model.n), ("symmetric", model.n))
+    given: tuple[Shape, ...] = (("scalar", 1), ("vector", model.q), ("vector", model.p))
+    return one_lane(partial(_advance, model, gamma), (*state, *given), state)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -14,14 +16,20 @@ from testbed.estimator.riccati import Gain, phi, predict
 from testbed.numerics.lanes import (
     Component,
     Floats,
+    Mask,
+    Matrix,
     Vector,
+    add,
     all_of,
     any_of,
     constant_times,
     mask_of,
+    one_lane,
+    scale,
     vector_of,
     where_vector,
 )
+from testbed.numerics.symbols import Shape
 from testbed.scenario import ConstantInput, Input, NoLoss, Scenario
 
 
@@ -51,15 +59,10 @@ class Kfio:
         """Raises MissingAck where ν_{k−1} matters and is not known."""
         model, gamma = self._model, mask_of(arrived)
         self._k += 1
-        push = model.control_effect(vector_of(u)) if model.q else []
+        push = model.control_effect(vector_of(u)) if model.q else [0.0] * model.n
         nu = self._nu(push, acks)
-        mean = constant_times(model.a, self._x)
-        if push:
-            mean = [m + nu * b for m, b in zip(mean, push, strict=True)]
-        covariance = predict(model.a, self._p, model.noise)
-        gain = Gain(covariance, model.c, model.sensor_noise)
-        self._p = phi(covariance, gain, gamma)
-        self._x = where_vector(gamma, gain.correct(mean, vector_of(y)), mean) if any_of(gamma) else mean
+        advance = _one_lane(model, gamma) if isinstance(gamma, bool) else partial(_advance, model, gamma)
+        self._x, self._p = advance(self._x, self._p, push, nu, vector_of(y))
         return Estimate(self._x, self._p, self._lanes)
 
     def _nu(self, push: Vector, acks: tuple[Ack, ...]) -> Component:
@@ -76,6 +79,24 @@ class Kfio:
                 'give it acks = "perfect", or use aoe, ff or oe'
             )
         return nu
+
+
+def _advance(
+    model: Model, gamma: Mask, x: Vector, P: Matrix, push: Vector, nu: Component, y: Vector
+) -> tuple[Vector, Matrix]:
+    """One step from x̂ and P, with push = B u and known ν."""
+    mean = add(constant_times(model.a, x), scale(nu, push)) if model.q else constant_times(model.a, x)
+    covariance = predict(model.a, P, model.noise)
+    gain = Gain(covariance, model.c, model.sensor_noise)
+    updated = where_vector(gamma, gain.correct(mean, y), mean) if any_of(gamma) else mean
+    return updated, phi(covariance, gain, gamma)
+
+
+@lru_cache(maxsize=16)
+def _one_lane(model: Model, gamma: bool) -> Callable[..., tuple[Any, ...]]:
+    state: tuple[Shape, ...] = (("vector", model.n), ("symmetric", model.n))
+    given: tuple[Shape, ...] = (("vector", model.n), ("scalar", 1), ("vector", model.p))
+    return one_lane(partial(_advance, model, gamma), (*state, *given), state)
 
 
 def _zero(source: Input | None) -> bool:

@@ -33,8 +33,8 @@ class Collector:
         self._until = {spec.name: spec.until or scenario.steps for spec in scenario.estimators}
         self._with_bounds = scenario.bounds
         self._steps = scenario.steps
-        self.estimators = {spec.name: Series(ERROR_FIGURES) for spec in scenario.estimators}
-        self.bounds = Series(("lower", "upper", "upper_correlated"))
+        self.estimators = {spec.name: Series(ERROR_FIGURES, scenario.lanes) for spec in scenario.estimators}
+        self.bounds = Series(("lower", "upper", "upper_correlated"), scenario.lanes)
         self.completed = 0
         self.applied = 0
         """Lane-packets of control that the plant says it applied."""
@@ -49,7 +49,7 @@ class Collector:
         pending.truth = vector_of(arrays["x"])
         self.applied += int(np.count_nonzero(arrays["nu"]))
         for name, x_hat, P in pending.estimates:
-            self._reduce(name, step, pending.truth, x_hat, P)
+            self._reduce(name, step, lane, pending.truth, x_hat, P)
         pending.estimates.clear()
         self._done(step, lane, "truth")
 
@@ -59,7 +59,7 @@ class Collector:
         if pending.truth is None:
             pending.estimates.append((name, x_hat, P))
         else:
-            self._reduce(name, step, pending.truth, x_hat, P)
+            self._reduce(name, step, lane, pending.truth, x_hat, P)
         self._done(step, lane, f"estimate of {name}")
 
     def bound(self, step: int, lane: int, arrays: Arrays) -> None:
@@ -67,7 +67,7 @@ class Collector:
         for name in ("upper", "upper_correlated"):
             if f"trace_{name}" in arrays:
                 figures[name] = _component(arrays[f"trace_{name}"])
-        self.bounds.add(step, figures)
+        self.bounds.add(step, lane, figures)
         self._of(step, lane)
         self._done(step, lane, "bounds")
 
@@ -79,9 +79,9 @@ class Collector:
             awaited |= self._of(step, lane).awaited
         return f"step {step}: {', '.join(sorted(awaited))}"
 
-    def _reduce(self, name: str, step: int, x: Vector, x_hat: Vector, P: Matrix) -> None:
+    def _reduce(self, name: str, step: int, lane: int, x: Vector, x_hat: Vector, P: Matrix) -> None:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            self.estimators[name].add(step, error_figures(x, x_hat, P))
+            self.estimators[name].add(step, lane, error_figures(x, x_hat, P))
 
     def _of(self, step: int, lane: int) -> _Pending:
         blocks = self._pending.get(step)

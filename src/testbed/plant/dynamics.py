@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,14 +16,17 @@ from testbed.numerics.lanes import (
     Mask,
     Vector,
     add,
+    any_of,
     array_of,
     constant,
     constant_times,
+    one_lane,
     vector_of,
     where,
 )
 from testbed.numerics.streams import Stream
-from testbed.scenario import Scenario
+from testbed.numerics.symbols import Shape
+from testbed.scenario import Scenario, System
 
 
 def root(covariance: Floats) -> Floats:
@@ -35,12 +43,7 @@ class Plant:
 
     def __init__(self, scenario: Scenario, lane: int, lanes: int) -> None:
         system = scenario.system
-        g = np.eye(system.n) if system.G is None else np.array(system.G)
-        self._lanes = lanes
-        self._a, self._c = constant(system.A), constant(system.C)
-        self._b: Constant | None = None if system.B is None else constant(system.B)
-        self._process_root = constant(g @ root(np.array(system.Q)))
-        self._sensor_root = constant(root(np.array(system.R)))
+        self._lanes, self._matrices = lanes, _matrices(scenario.system)
 
         def stream(purpose: str, width: int) -> Stream:
             return Stream(scenario.seed, "plant", purpose, width=width, lane=lane, lanes=lanes)
@@ -52,14 +55,52 @@ class Plant:
 
     def move(self, u: Floats | None, applied: Mask) -> tuple[Floats, Floats]:
         """One step: apply u (M, q) where ``applied``, zero elsewhere. Returns x_{k+1} (M, n) and y_{k+1} (M, p)."""
-        x = constant_times(self._a, self.x)
-        if self._b is not None and u is not None:
-            x = [a + where(applied, b, 0.0) for a, b in zip(x, constant_times(self._b, vector_of(u)), strict=True)]
-        self.x = add(x, constant_times(self._process_root, self._process.normals(self._k)))
+        if u is None:
+            applied = False
+        advance = _one_lane(self._matrices, applied) if self._lanes == 1 else partial(_advance, self._matrices, applied)
+        control = [0.0] * self._matrices.q if u is None else vector_of(u)
+        w, v = self._process.normals(self._k), self._sensor.normals(self._k + 1)
+        self.x, y = advance(self.x, control, w, v)
         self._k += 1
-        noise = constant_times(self._sensor_root, self._sensor.normals(self._k))
-        y = add(constant_times(self._c, self.x), noise)
         return array_of(self.x, self._lanes), array_of(y, self._lanes)
+
+
+@dataclass(frozen=True)
+class _Matrices:
+    """The plant's matrices; the noises enter through square roots of their covariances."""
+
+    a: Constant
+    b: Constant | None
+    c: Constant
+    process: Constant
+    sensor: Constant
+    q: int
+
+
+@lru_cache(maxsize=16)
+def _matrices(system: System) -> _Matrices:
+    g = np.eye(system.n) if system.G is None else np.array(system.G)
+    process, sensor = constant(g @ root(np.array(system.Q))), constant(root(np.array(system.R)))
+    b = None if system.B is None else constant(system.B)
+    return _Matrices(constant(system.A), b, constant(system.C), process, sensor, system.q)
+
+
+def _advance(m: _Matrices, applied: Mask, x: Vector, u: Vector, w: Vector, v: Vector) -> tuple[Vector, Vector]:
+    moved = constant_times(m.a, x)
+    if m.b is not None and any_of(applied):
+        push = [where(applied, b, 0.0) for b in constant_times(m.b, u)]
+        moved = add(moved, push)
+    x = add(moved, constant_times(m.process, w))
+    return x, add(constant_times(m.c, x), constant_times(m.sensor, v))
+
+
+@lru_cache(maxsize=32)
+def _one_lane(m: _Matrices, applied: bool) -> Callable[..., tuple[Any, ...]]:
+    n, p = len(m.a), len(m.c)
+    noises: tuple[Shape, ...] = (("vector", len(m.process[0])), ("vector", p))
+    return one_lane(
+        partial(_advance, m, applied), (("vector", n), ("vector", m.q), *noises), (("vector", n), ("vector", p))
+    )
 
 
 def bits(mask: Mask) -> NDArray[np.uint8]:

@@ -1,0 +1,101 @@
+"""Means and standard errors over lanes that do not depend on how the lanes were split.
+
+A sum of floating-point numbers depends on the order of its terms. Here the order is fixed by the lanes themselves: they
+are taken in groups of 64 in a row, each group is summed as a whole, whichever packets brought its lanes, and the
+groups are merged in order with exact sums. Within a group the deviations are taken from the group's own mean, and
+groups are merged by the formula of Chan, Golub and LeVeque (The American Statistician 37, 1983), so that nothing
+cancels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from testbed.numerics.lanes import Floats
+
+GROUP = 64
+
+
+class LaneMoments:
+    """Count, mean and squared deviations of F figures over the lanes 0 … lanes − 1, brought in blocks in any order.
+
+    Values that are not finite are left out and counted.
+    """
+
+    def __init__(self, figures: int, lanes: int) -> None:
+        groups = -(-lanes // GROUP)
+        self._figures, self._lanes = figures, lanes
+        self._count = np.zeros((figures, groups))
+        self._sum = np.zeros((figures, groups))
+        self._squares = np.zeros((figures, groups))
+        self._partial: dict[int, tuple[Floats, int]] = {}
+
+    def add(self, lane: int, values: Floats) -> None:
+        """Values of shape (F, M) of the lanes lane … lane + M − 1."""
+        end, position = lane + values.shape[1], lane
+        while position < end:
+            group = position // GROUP
+            begin, stop = group * GROUP, min((group + 1) * GROUP, self._lanes)
+            if position == begin and end >= stop:
+                whole = (end - position) // GROUP if stop - begin == GROUP else 1
+                taken = whole * (stop - begin)
+                block = values[:, position - lane : position - lane + taken]
+                self._reduce(group, block.reshape(self._figures, whole, stop - begin))
+            else:
+                taken = min(end, stop) - position
+                self._gather(
+                    group, position - begin, values[:, position - lane : position - lane + taken], stop - begin
+                )
+            position += taken
+
+    def result(self, figure: int) -> tuple[int, float | None, float | None]:
+        """(number of values, mean, standard error of the mean); None where there are too few values."""
+        count, total, squares = (a[figure].tolist() for a in (self._count, self._sum, self._squares))
+        n = sum(count)
+        if n == 0:
+            return 0, None, None
+        mean = _sum(total) / n
+        if n < 2:
+            return int(n), mean, None
+        between = [c * (t / c - mean) * (t / c - mean) for c, t in zip(count, total, strict=True) if c]
+        return int(n), mean, math.sqrt((_sum(squares) + _sum(between)) / (n * (n - 1)))
+
+    def _gather(self, group: int, offset: int, values: Floats, size: int) -> None:
+        buffer, filled = self._partial.pop(group, (None, 0))
+        if buffer is None:
+            buffer = np.empty((self._figures, size))
+        buffer[:, offset : offset + values.shape[1]] = values
+        filled += values.shape[1]
+        if filled == size:
+            self._reduce(group, buffer[:, None, :])
+        else:
+            self._partial[group] = buffer, filled
+
+    def _reduce(self, group: int, values: Floats) -> None:
+        """Whole groups from ``group`` on: values (F, G, lanes of a group)."""
+        here = slice(group, group + values.shape[1])
+        total = values.sum(axis=2)
+        if np.isfinite(total).all():
+            away = values - (total / values.shape[2])[:, :, None]
+            self._count[:, here] = values.shape[2]
+            self._sum[:, here] = total
+            self._squares[:, here] = np.multiply(away, away, out=away).sum(axis=2)
+            return
+        for figure, row in enumerate(values):
+            for i, lanes in enumerate(row):
+                usable = lanes[np.abs(lanes) < 1e300]
+                count = len(usable)
+                total_here = usable.sum() if count else 0.0
+                self._count[figure, group + i] = count
+                self._sum[figure, group + i] = total_here
+                self._squares[figure, group + i] = np.square(usable - total_here / count).sum() if count else 0.0
+
+
+def _sum(values: list[float]) -> float:
+    """The correctly rounded sum; infinite where it overflows."""
+    try:
+        return math.fsum(values)
+    except (OverflowError, ValueError):
+        return math.inf
