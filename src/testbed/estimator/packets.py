@@ -4,29 +4,31 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
-from testbed.errors import TestbedError, UsageError
+from testbed.errors import RunFailed, TestbedError, UsageError
 from testbed.estimator.model import Ack, Estimator, Model
+
+Bit = Annotated[int, Field(ge=0, le=1)]
 
 
 class PacketLine(BaseModel):
     """One line of PACKETS.jsonl."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    k: Annotated[int, Field(ge=1, strict=True, description="step, 1, 2, … without gaps")]
+    k: Annotated[int, Field(ge=1, description="step, 1, 2, … without gaps")]
     u: Annotated[list[FiniteFloat] | None, Field(description="u_{k−1} as sent")] = None
     y: Annotated[list[FiniteFloat] | None, Field(description="y_k; null: nothing arrived")] = None
     gamma: Annotated[
-        Literal[0, 1] | None,
+        Bit | None,
         Field(description="1 where y is given; 0 with a y: the packet carried only noise"),
     ] = None
     acks: Annotated[
-        list[tuple[Annotated[int, Field(ge=0, strict=True)], Literal[0, 1]]],
+        list[tuple[Annotated[int, Field(ge=0)], Bit]],
         Field(description="[j, ν_j] that became known at this step"),
     ] = []
 
@@ -70,14 +72,18 @@ def _check(line: PacketLine, expected: int, model: Model) -> None:
 
 
 def replay(estimator: Estimator, model: Model, packets: Iterable[PacketLine], *, use_acks: bool) -> Iterator[str]:
-    """Lines of OUT.jsonl: k, x_hat, P."""
+    """Lines of OUT.jsonl: k, x_hat, P. Raises what the estimator raises, and RunFailed for what is not finite."""
     for line in packets:
         arrived = line.y is not None and line.gamma != 0
         y = line.y if arrived and line.y is not None else [0.0] * model.p
         acks = tuple(Ack(j, np.array([nu]), np.array([1])) for j, nu in line.acks) if use_acks else ()
         try:
-            estimate = estimator.step(np.array([line.u or []]), np.array([y]), np.array([arrived]), acks)
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                estimate = estimator.step(np.array([line.u or []]), np.array([y]), np.array([arrived]), acks)
+                x_hat, P = estimate.x_hat[0], estimate.P[0]
         except TestbedError as error:
             raise type(error)(f"step {line.k}: {error}") from None
-        out: dict[str, Any] = {"k": line.k, "x_hat": estimate.x_hat[0].tolist(), "P": estimate.P[0].tolist()}
+        if not (np.isfinite(x_hat).all() and np.isfinite(P).all()):
+            raise RunFailed(f"step {line.k}: the estimate left the range of floating-point numbers")
+        out: dict[str, Any] = {"k": line.k, "x_hat": x_hat.tolist(), "P": P.tolist()}
         yield json.dumps(out)

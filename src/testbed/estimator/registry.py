@@ -99,13 +99,12 @@ def _checked(kind: str, factory: Callable[..., Estimator], options: dict[str, An
     for parameter in parameters:
         if parameter.name not in options and parameter.default is inspect.Parameter.empty:
             raise UsageError(f"estimator {kind!r}: option {parameter.name!r} is missing")
-    try:
-        return {
-            name: TypeAdapter(hints.get(name, Any)).validate_python(value, strict=True)
-            for name, value in options.items()
-        }
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        given = first["input"]
-        name = next(n for n, v in options.items() if v is given or v == given)
-        raise UsageError(f"estimator {kind!r}: {name}: got {given!r}; {first['msg'].lower()}") from None
+    checked = {}
+    for name, value in options.items():
+        try:
+            checked[name] = TypeAdapter(hints.get(name, Any)).validate_python(value, strict=True)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            given = first["input"]
+            raise UsageError(f"estimator {kind!r}: {name}: got {given!r}; {first['msg'].lower()}") from None
+    return checked

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,44 +19,50 @@ TILE = 16
 _FEW = 64  # lanes up to which a whole tile is transformed at once
 
 
+@dataclass
+class _Tile:
+    """Random words of TILE steps, and what a law made of them."""
+
+    number: int
+    raw: NDArray[np.uint64]
+    rows: list[Vector] | None = None
+
+
 class Stream:
     """Draws for the lanes lane … lane + lanes − 1, ``width`` numbers a lane and step.
 
-    A stream is of one law, uniform or normal. Steps may be asked for in any order; in order is fast.
+    Uniform and normal draws of one stream are not independent: ask for one law.
+    Steps may be asked for in any order; in order is fast.
     """
 
     def __init__(self, seed: int, component: str, purpose: str, *, width: int, lane: int, lanes: int) -> None:
         digest = hashlib.blake2b(f"{seed}|{component}|{purpose}".encode(), digest_size=16).digest()
         self._key = np.frombuffer(digest, dtype="<u8").astype(np.uint64)
         self._width, self._lane, self._lanes = width, lane, lanes
-        self._words = width + width % 2
-        self._number = -1
-        self._raw: NDArray[np.uint64]
-        self._rows: list[Vector] | None = None
+        self._tiles: dict[int, _Tile] = {}
 
     def uniforms(self, step: int) -> Vector:
         """``width`` components, uniform on [0, 1)."""
-        return self._row(self._uniform, step)[: self._width]
+        return self._row(self._uniform, self._width, step)
 
     def normals(self, step: int) -> Vector:
         """``width`` components, standard normal (Box and Muller)."""
-        return self._row(self._normal, step)
+        return self._row(self._normal, self._width + self._width % 2, step)
 
-    def _row(self, law: Callable[[NDArray[np.uint64]], Floats], step: int) -> Vector:
+    def _row(self, law: Callable[[NDArray[np.uint64]], Floats], words: int, step: int) -> Vector:
         number, offset = divmod(step, TILE)
-        if number != self._number:
-            self._number, self._rows = number, None
-            self._raw = self._raw_tile(number)
+        tile = self._tiles.get(words)
+        if tile is None or tile.number != number:
+            tile = self._tiles[words] = _Tile(number, self._raw_tile(number, words))
         if self._lanes > _FEW:
-            return list(law(self._raw[offset : offset + 1])[0])
-        if self._rows is None:
-            rows = law(self._raw)
-            self._rows = rows[:, :, 0].tolist() if self._lanes == 1 else list(rows)
-        return list(self._rows[offset])
+            return list(law(tile.raw[offset : offset + 1])[0])
+        if tile.rows is None:
+            rows = law(tile.raw)
+            tile.rows = rows[:, :, 0].tolist() if self._lanes == 1 else list(rows)
+        return list(tile.rows[offset])
 
-    def _raw_tile(self, number: int) -> NDArray[np.uint64]:
+    def _raw_tile(self, number: int, words: int) -> NDArray[np.uint64]:
         """Random words of shape (TILE, words, lanes), 53 bits each."""
-        words = self._words
         counter = np.array([self._lane * TILE * words // 4, words, number, 0], dtype=np.uint64)
         raw = np.random.Philox(key=self._key, counter=counter).random_raw(self._lanes * TILE * words)
         raw >>= np.uint64(11)
@@ -65,7 +72,7 @@ class Stream:
         return raw.astype(np.float64) * 2.0**-53
 
     def _normal(self, raw: NDArray[np.uint64]) -> Floats:
-        pairs = self._words // 2
+        pairs = raw.shape[1] // 2
         radius = (raw[:, :pairs] + np.uint64(1)).astype(np.float64)
         radius *= 2.0**-53
         np.log(radius, out=radius)

@@ -31,4 +31,4 @@ def unbundle(payload: bytes) -> list[bytes]:
         if begin > len(payload) or offset > len(payload):
             return [payload]
         messages.append(payload[begin:offset])
-    return messages if offset == len(payload) else [payload]
+    return messages if messages and offset == len(payload) else [payload]
