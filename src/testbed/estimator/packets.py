@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from testbed.errors import RunFailed, TestbedError, UsageError
 from testbed.estimator.model import Ack, Estimator, Model
@@ -28,14 +28,9 @@ class PacketLine(BaseModel):
         Field(description="1 where y is given; 0 with a y: the packet carried only noise"),
     ] = None
     acks: Annotated[
-        list[tuple[Annotated[int, Field(ge=0)], Bit]],
+        list[tuple[Annotated[int, Field(ge=0)], Bit]] | None,
         Field(description="[j, ν_j] that became known at this step"),
-    ] = []
-
-    @field_validator("acks", mode="before")
-    @classmethod
-    def _no_acks(cls, value: object) -> object:
-        return [] if value is None else value
+    ] = None
 
 
 def read_packets(lines: Iterable[str], model: Model) -> Iterator[PacketLine]:
@@ -66,7 +61,7 @@ def _check(line: PacketLine, expected: int, model: Model) -> None:
         raise UsageError(f"y: got {len(line.y)} numbers; allowed: {model.p}, or null")
     if line.gamma == 1 and line.y is None:
         raise UsageError("gamma: got 1 without y; allowed: 0 or left out where nothing arrived")
-    for j, _ in line.acks:
+    for j, _ in line.acks or ():
         if j >= line.k:
             raise UsageError(f"acks: got control packet {j} at step {line.k}; allowed: 0 … {line.k - 1}")
 
@@ -76,7 +71,7 @@ def replay(estimator: Estimator, model: Model, packets: Iterable[PacketLine], *,
     for line in packets:
         arrived = line.y is not None and line.gamma != 0
         y = line.y if arrived and line.y is not None else [0.0] * model.p
-        acks = tuple(Ack(j, np.array([nu]), np.array([1])) for j, nu in line.acks) if use_acks else ()
+        acks = tuple(Ack(j, np.array([nu]), np.array([1])) for j, nu in line.acks or ()) if use_acks else ()
         try:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 estimate = estimator.step(np.array([line.u or []]), np.array([y]), np.array([arrived]), acks)
