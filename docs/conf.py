@@ -10,4 +10,4 @@ root_doc = "contents"
 exclude_patterns = ["_build"]
 myst_heading_anchors = 3
 html_theme = "alabaster"
-html_theme_options = {"page_width": "1100px", "description": "State estimation over lossy networks"}
+html_theme_options = {"page_width": "1300px", "description": "State estimation over lossy networks"}

@@ -139,13 +139,15 @@ def messages_page() -> str:
         "What goes over the bus, and on which key. `testbed schema messages` prints the JSON Schema of the headers, "
         "`testbed schema asyncapi` all of this as an AsyncAPI document.",
         [
-            "## Format\n\n" + re.sub(r"'(\w+|x-arrays)'", r"`\1`", schemas["description"]),
+            "## Format\n\n"
+            + re.sub(r"'(\w+|x-arrays)'", r"`\1`", f"{schemas['description']}\n\n{schemas['x-bundle']}"),
             "## Keys\n\n"
             + _table(("key", "type", "from → to"), rows)
             + "\n\n"
             + document["info"]["description"]
             # the format is said above
             .replace(schemas["description"], "")
+            .replace(schemas["x-bundle"], "")
             .strip(),
             "## Fields of every header\n\n"
             + _fields(common, [n for n in COMMON_FIELDS if n != "type"])

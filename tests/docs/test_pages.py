@@ -60,6 +60,14 @@ def test_scenarios_can_run(path: Path) -> None:
     assert scenario.name == path.stem
 
 
+def test_every_reason_for_a_refusal_is_explained() -> None:
+    text = "".join(path.read_text() for path in (ROOT / "src" / "testbed" / "wire").glob("*.py"))
+    page = (ROOT / "docs" / "reference" / "errors.md").read_text()
+    reasons = set(re.findall(r'Rejected\("(\w+)"', text))
+    assert reasons
+    assert [reason for reason in sorted(reasons) if f"`{reason}`" not in page] == []
+
+
 def test_the_example_needs_zenoh_and_the_standard_library_only() -> None:
     source = (ROOT / "examples" / "print_estimates.py").read_text()
     names = {name.name.split(".")[0] for node in ast.walk(ast.parse(source)) for name in getattr(node, "names", ())}
