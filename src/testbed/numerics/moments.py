@@ -74,7 +74,11 @@ class LaneMoments:
             self._partial[group] = buffer, filled
 
     def _reduce(self, group: int, values: Floats) -> None:
-        """Whole groups from ``group`` on: values (F, G, lanes of a group)."""
+        """Whole groups from ``group`` on: values (F, G, lanes of a group). What overflows has no figure."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._reduce_quietly(group, values)
+
+    def _reduce_quietly(self, group: int, values: Floats) -> None:
         here = slice(group, group + values.shape[1])
         total = values.sum(axis=2)
         if np.isfinite(total).all():
@@ -85,7 +89,7 @@ class LaneMoments:
             return
         for figure, row in enumerate(values):
             for i, lanes in enumerate(row):
-                usable = lanes[np.abs(lanes) < 1e300]
+                usable = lanes[np.isfinite(lanes)]
                 count = len(usable)
                 total_here = usable.sum() if count else 0.0
                 self._count[figure, group + i] = count

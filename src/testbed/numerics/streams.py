@@ -39,7 +39,7 @@ class Stream:
         digest = hashlib.blake2b(f"{seed}|{component}|{purpose}".encode(), digest_size=16).digest()
         self._key = np.frombuffer(digest, dtype="<u8").astype(np.uint64)
         self._width, self._lane, self._lanes = width, lane, lanes
-        self._tiles: dict[int, _Tile] = {}
+        self._tiles: dict[str, _Tile] = {}
 
     def uniforms(self, step: int) -> Vector:
         """``width`` components, uniform on [0, 1)."""
@@ -51,9 +51,9 @@ class Stream:
 
     def _row(self, law: Callable[[NDArray[np.uint64]], Floats], words: int, step: int) -> Vector:
         number, offset = divmod(step, TILE)
-        tile = self._tiles.get(words)
+        tile = self._tiles.get(law.__name__)
         if tile is None or tile.number != number:
-            tile = self._tiles[words] = _Tile(number, self._raw_tile(number, words))
+            tile = self._tiles[law.__name__] = _Tile(number, self._raw_tile(number, words))
         if self._lanes > _FEW:
             return list(law(tile.raw[offset : offset + 1])[0])
         if tile.rows is None:
