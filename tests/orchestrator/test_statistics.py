@@ -44,9 +44,9 @@ def test_nees_is_not_defined_where_P_is_not_definite() -> None:
     x, x_hat, P = sample(3, 2, seed=1)
     P[1] = [[1.0, 2.0], [2.0, 1.0]]
     P[2] = 0.0
-    series = Series(ERROR_FIGURES)
+    series = Series(ERROR_FIGURES, lanes=3)
     with np.errstate(all="ignore"):
-        series.add(1, error_figures(vector_of(x), vector_of(x_hat), matrix_of(P)))
+        series.add(1, 0, error_figures(vector_of(x), vector_of(x_hat), matrix_of(P)))
     series.close(1)
     assert series.undefined == 2
     e = (x - x_hat)[0]
@@ -71,10 +71,10 @@ def test_series_are_numpy_means_step_by_step(data: st.DataObject) -> None:
     values = rng.normal(size=(steps, lanes)) * 10.0 ** data.draw(st.integers(-6, 6))
     cuts = [0, *sorted(data.draw(st.sets(st.integers(1, lanes - 1), max_size=3))), lanes]
     pieces = [(k, slice(a, b)) for k in range(steps) for a, b in pairwise(cuts)]
-    series = Series(("figure",))
+    series = Series(("figure",), lanes)
     for k, lanes_of_piece in data.draw(st.permutations(pieces)):
         piece = values[k, lanes_of_piece]
-        series.add(k + 1, {"figure": float(piece[0]) if len(piece) == 1 else piece})
+        series.add(k + 1, lanes_of_piece.start, {"figure": float(piece[0]) if len(piece) == 1 else piece})
     for k in range(steps):
         series.close(k + 1)
     np.testing.assert_allclose(series.mean["figure"], values.mean(axis=1), rtol=1e-9, atol=1e-12 * np.abs(values).max())
@@ -82,9 +82,21 @@ def test_series_are_numpy_means_step_by_step(data: st.DataObject) -> None:
 
 
 def test_a_step_without_values_has_no_figures() -> None:
-    series = Series(("lower", "upper"))
-    series.add(1, {"lower": 2.0})
-    series.close(1)
-    series.close(2)
-    assert series.mean == {"lower": [2.0, None], "upper": [None, None]}
-    assert series.stderr == {"lower": [None, None], "upper": [None, None]}
+    for lanes in (1, 2):
+        series = Series(("lower", "upper"), lanes)
+        series.add(1, 0, {"lower": 2.0 if lanes == 1 else np.array([1.0, 3.0])})
+        series.close(1)
+        series.close(2)
+        assert series.mean == {"lower": [2.0, None], "upper": [None, None]}
+        assert series.stderr == {"lower": [None if lanes == 1 else 1.0, None], "upper": [None, None]}
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_one_lane_without_a_figure_has_none(wrong: float) -> None:
+    series = Series(("nees", "other"), lanes=1)
+    series.add(1, 0, {"nees": wrong, "other": wrong})
+    series.add(2, 0, {"nees": 1.0, "other": 2.0})
+    for step in (1, 2):
+        series.close(step)
+    assert series.mean == {"nees": [None, 1.0], "other": [None, 2.0]}
+    assert series.undefined == 1
