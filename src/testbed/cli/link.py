@@ -11,7 +11,9 @@ import typer
 from testbed.errors import UsageError, did_you_mean
 from testbed.wire.keys import LinkName
 
-app = typer.Typer(help="Look at one link of a scenario.", no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(help="Look at one link of a scenario.", rich_markup_mode=None)
+
+_LANE_MAX = 2**31 - 2  # the last lane of the largest scenario
 
 
 @app.callback()
@@ -39,6 +41,8 @@ def sample(
 
     loaded = load_scenario(scenario)
     link = _link(name)
+    if lane > _LANE_MAX:
+        raise UsageError(f"--lane {lane}: allowed: 0 … {_LANE_MAX}")
     if link == "ack" and loaded.links.ack.mode == "none":
         raise UsageError('--link ack: the scenario has none; allowed: with [links.ack] mode = "perfect" or "link"')
     trace = sample_trace(loaded, link, number, seed=loaded.seed if seed is None else seed, lane=lane)

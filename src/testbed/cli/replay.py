@@ -34,15 +34,17 @@ def replay(
     model = model_of(loaded)
     made = create(spec.kind, model, lanes=1, options=spec.options)
     lines = _lines(packets, lane, perfect=spec.acks == "perfect")
+    written = []
     try:
-        estimates = replay_packets(made, model, read_packets(lines, model), use_acks=spec.acks != "none")
-        if out is None:
-            for line in estimates:
+        for line in replay_packets(made, model, read_packets(lines, model), use_acks=spec.acks != "none"):
+            if out is None:
                 sys.stdout.write(line + "\n")
-        else:
-            _write(out, list(estimates))
+            else:
+                written.append(line)
     except UsageError as error:
         raise UsageError(f"{packets}: {error}") from None
+    if out is not None:
+        _write(out, written)
     for name, count in sorted(made.counters.items()):
         if count:
             typer.echo(f"testbed: {estimator}: {name} {count}", err=True)
