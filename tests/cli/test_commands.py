@@ -1,0 +1,224 @@
+"""What the commands do, print and leave behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from jsonschema import Draft202012Validator
+
+from cli.commands import TABLES, Command, testbed, write
+from testbed import __version__
+from testbed.estimator.registry import create, model_of
+from testbed.scenario import load_scenario, parse_scenario, scenario_json_schema, to_dict
+
+__all__ = ["testbed"]
+
+
+@pytest.fixture
+def no_report() -> object:
+    """Drawing the report takes seconds."""
+    with patch("testbed.orchestrator.report.write_report") as writing:
+        yield writing
+
+
+def test_help_and_version(testbed: Command) -> None:
+    for arguments in ((), ("--help",)):
+        shown = testbed(*arguments)
+        assert (shown.code, shown.err) == (0, "")
+        for name in ("run", "replay", "schema", "link"):
+            assert name in shown.out
+    assert testbed("--version").out == f"testbed {__version__}\n"
+    for command in ("run", "replay", "schema", "link"):
+        assert testbed(command, "--help").code == 0
+
+
+def test_a_run_leaves_its_files_and_prints_tables(testbed: Command, tmp_path: Path) -> None:
+    shown = testbed("run", "s.toml", "--in-process", "--out", "out")
+    assert shown.code == 0
+    assert shown.err == ""
+    assert "small: 12 steps, 3 lanes, seed 5" in shown.out
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert files == {"scenario.toml", "summary.json", "recording.mcap", "report.html"}
+    assert load_scenario(tmp_path / "out" / "scenario.toml") == load_scenario(tmp_path / "s.toml")
+
+
+def test_json_is_the_summary(testbed: Command, tmp_path: Path, no_report: object) -> None:
+    shown = testbed("run", "s.toml", "--in-process", "--json", "--out", "out")
+    assert shown.code == 0
+    assert shown.out == (tmp_path / "out" / "summary.json").read_text()
+    summary = json.loads(shown.out)
+    assert (summary["status"], summary["completed_steps"], summary["version"]) == ("complete", 12, 1)
+    assert list(summary["estimators"]) == ["aoe", "kfio"]
+    assert all(len(summary["estimators"]["aoe"][key]) == 12 for key in ("trace_P_mean", "nees_stderr"))
+    Draft202012Validator(json.loads(testbed("schema", "summary").out)).validate(summary)
+
+
+def test_without_out_a_run_goes_into_a_folder_of_its_own(testbed: Command, tmp_path: Path, no_report: object) -> None:
+    write(tmp_path / "odd.toml", name="a/b c", record="none", lanes=1)
+    assert testbed("run", "odd.toml", "--in-process", "-q").code == 0
+    (made,) = (tmp_path / "runs").iterdir()
+    assert made.name.startswith("a-b-c-")
+    assert (made / "summary.json").exists()
+
+
+def test_a_run_that_fails_says_so_and_keeps_what_there_is(testbed: Command, tmp_path: Path, no_report: object) -> None:
+    system = {"A": [[1e100]], "C": [[1.0]], "Q": [[1.0]], "R": [[1.0]]}
+    lost = {"observation": {"loss": {"kind": "bernoulli", "arrival": 0.0}}}
+    write(tmp_path / "wild.toml", system=system, input=None, links=lost, estimators=[{"name": "kfio"}])
+    shown = testbed("run", "wild.toml", "--in-process", "--json", "--out", "out")
+    assert shown.code == 1
+    assert json.loads(shown.out)["status"] == "failed"
+    assert shown.err.startswith("testbed: run failed: ")
+    assert len(shown.err.splitlines()) == 1
+
+
+def test_the_scenarios_that_come_with_it_run(testbed: Command, tmp_path: Path, no_report: object) -> None:
+    given = sorted((Path(__file__).parents[2] / "scenarios").glob("*.toml"))
+    assert given
+    for file in given:
+        small = {**to_dict(load_scenario(file)), "steps": 6, "lanes": 2}
+        for spec in small["estimators"]:
+            spec.pop("until", None)
+        write(tmp_path / file.name, **small)
+        assert testbed("run", file.name, "--in-process", "--out", f"out-{file.stem}").code == 0
+
+
+def test_replay_gives_the_estimates_of_the_run(testbed: Command, tmp_path: Path, no_report: object) -> None:
+    write(tmp_path / "s.toml", record="all")
+    testbed("run", "s.toml", "--in-process", "--out", "out")
+    printed = testbed("replay", "s.toml", "out/recording.mcap", "--estimator", "kfio", "--lane", 2)
+    assert (printed.code, printed.err) == (0, "")
+    written = testbed("replay", "s.toml", "out/recording.mcap", "--estimator", "kfio", "--lane", 2, "--out", "o.jsonl")
+    assert (written.code, written.out) == (0, "")
+    assert (tmp_path / "o.jsonl").read_text() == printed.out
+    assert testbed("replay", "s.toml", "out/recording.mcap", "--estimator", "kfio").out != printed.out
+    lines = [json.loads(line) for line in printed.out.splitlines()]
+    assert [line["k"] for line in lines] == list(range(1, 13))
+    assert np.shape([line["P"] for line in lines]) == (12, 2, 2)
+
+
+PACKETS = [
+    {"k": 1, "u": [1.0], "y": [0.5], "acks": [[0, 1]]},
+    {"k": 2, "u": [1.0], "y": None, "acks": [[1, 0]]},
+    {"k": 3, "u": [1.0], "y": [2.0], "acks": [[2, 1]]},
+]
+
+
+def test_replay_reads_packets_of_any_origin(testbed: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import io
+    import sys
+
+    text = "".join(json.dumps(packet) + "\n" for packet in PACKETS)
+    (tmp_path / "p.jsonl").write_text(text)
+    model = model_of(parse_scenario(TABLES))
+    for name in ("kfio", "oe", "ff"):  # oe and ff are kinds that the scenario does not name
+        shown = testbed("replay", "s.toml", "p.jsonl", "--estimator", name)
+        assert shown.code == 0
+        monkeypatch.setattr(sys, "stdin", io.StringIO(text))
+        assert testbed("replay", "s.toml", "-", "--estimator", name).out == shown.out
+        made = create(name, model, lanes=1)
+        for line, packet in zip(shown.out.splitlines(), PACKETS, strict=True):
+            from testbed.estimator.model import Ack
+
+            acks = tuple(Ack(j, np.array([nu]), np.ones(1)) for j, nu in packet["acks"])  # type: ignore[attr-defined]
+            y = packet["y"] or [0.0]
+            expected = made.step(np.array([packet["u"]]), np.array([y]), np.array([packet["y"] is not None]), acks)
+            assert json.loads(line)["x_hat"] == expected.x_hat[0].tolist()
+
+
+def test_replay_leaves_acks_out_where_the_table_says_none(testbed: Command, tmp_path: Path) -> None:
+    write(tmp_path / "s.toml", estimators=[{"name": "aoe"}, {"name": "blind", "kind": "aoe", "acks": "none"}])
+    with_acks, without = tmp_path / "with.jsonl", tmp_path / "without.jsonl"
+    with_acks.write_text("".join(json.dumps(packet) + "\n" for packet in PACKETS))
+    without.write_text("".join(json.dumps({**packet, "acks": []}) + "\n" for packet in PACKETS))
+    blind = testbed("replay", "s.toml", "with.jsonl", "--estimator", "blind").out
+    assert blind == testbed("replay", "s.toml", "without.jsonl", "--estimator", "aoe").out
+    assert blind != testbed("replay", "s.toml", "with.jsonl", "--estimator", "aoe").out
+
+
+def test_replay_tells_of_acks_that_came_too_late(testbed: Command, tmp_path: Path) -> None:
+    late = [{"k": 1, "u": [1.0]}, {"k": 2, "u": [1.0], "acks": [[0, 1]]}]
+    (tmp_path / "p.jsonl").write_text("".join(json.dumps(packet) + "\n" for packet in late))
+    shown = testbed("replay", "s.toml", "p.jsonl", "--estimator", "aoe")
+    assert shown.code == 0
+    assert shown.err == "testbed: aoe: late_acks 1\n"
+
+
+@pytest.mark.parametrize("seed", [None, 5, 6])
+def test_a_sample_is_what_a_run_with_that_seed_meets(
+    seed: int | None, testbed: Command, tmp_path: Path, no_report: object
+) -> None:
+    arguments = [] if seed is None else ["--seed", seed]
+    shown = testbed(
+        "link",
+        "sample",
+        "s.toml",
+        "--link",
+        "observation",
+        "-n",
+        12,
+        "--out",
+        "t.csv",
+        "--lane",
+        1,
+        "--json",
+        *arguments,
+    )
+    assert (shown.code, shown.err) == (0, "")
+    with (tmp_path / "t.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["seq"]) for row in rows] == list(range(12))
+    fates = [row["delivered_ns"] != "" for row in rows]
+    figures = json.loads(shown.out)
+    assert (figures["sent"], figures["delivered"], figures["dropped"]) == (12, sum(fates), 12 - sum(fates))
+
+    from orchestrator.runs import recorded
+
+    write(tmp_path / "s.toml", seed=5 if seed is None else seed, record="all")
+    testbed("run", "s.toml", "--in-process", "--out", "out")
+    mask = recorded(tmp_path / "out", 3, 12)["observation/delivered"]["mask"]
+    assert fates == [bool(bit) for bit in mask[:, 1]]
+
+
+def test_a_sample_in_words(testbed: Command) -> None:
+    shown = testbed("link", "sample", "s.toml", "--link", "control", "-n", 2000, "--out", "t.csv")
+    assert shown.code == 0
+    assert shown.out.startswith("control: 2000 sent, ")
+    assert "(expected 0.3)" in shown.out
+    assert len(shown.out.splitlines()) == 1
+
+
+@pytest.mark.parametrize("what", ["scenario", "messages", "summary"])
+def test_schemas_are_schemas(what: str, testbed: Command) -> None:
+    shown = testbed("schema", what)
+    assert (shown.code, shown.err) == (0, "")
+    Draft202012Validator.check_schema(json.loads(shown.out))
+
+
+def test_the_schema_of_the_scenario_is_the_default(testbed: Command) -> None:
+    shown = testbed("schema")
+    assert shown.out == testbed("schema", "scenario").out
+    assert json.loads(shown.out) == scenario_json_schema()
+
+
+def test_scenarios_are_valid_by_their_schema(testbed: Command, tmp_path: Path) -> None:
+    schema = Draft202012Validator(json.loads(testbed("schema").out))
+    schema.validate(TABLES)
+    schema.validate(to_dict(load_scenario(tmp_path / "s.toml")))
+    for file in (Path(__file__).parents[2] / "scenarios").glob("*.toml"):
+        import tomllib
+
+        schema.validate(tomllib.loads(file.read_text()))
+        schema.validate(to_dict(load_scenario(file)))
+    assert not schema.is_valid({**TABLES, "step": 3})
+
+
+def test_asyncapi_is_an_asyncapi_document(testbed: Command) -> None:
+    document = json.loads(testbed("schema", "asyncapi").out)
+    assert document["asyncapi"] == "3.0.0"
+    assert set(document) >= {"info", "channels", "components"}
