@@ -32,7 +32,7 @@ class BoundsService:
             for lane, lanes in setup.blocks
             if bound is not None and factor is not None and factor > 1.0
         }
-        self._send = node.sender(node.keys.bounds, BoundsMessage)
+        self._send = node.sender(node.keys.bounds, BoundsMessage, lazy=True)
         self.counters: dict[str, int] = {}
         node.on(node.keys.delivered("observation"), Observation, "link.observation", self._take, needs=("mask",))
 

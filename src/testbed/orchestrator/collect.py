@@ -13,54 +13,65 @@ from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures
 from testbed.wire.setup import Setup
 
 Arrays = dict[str, NDArray[Any]]
+TRUTH, BOUNDS = "truth", "bounds"
 
 
 @dataclass
-class _Pending:
-    """One step of one block: what has come and what is still awaited."""
+class _Step:
+    """One step: what is still awaited of each block, and what has come before its truth."""
 
-    awaited: set[str]
-    truth: Vector | None = None
-    estimates: list[tuple[str, Vector, Matrix]] = field(default_factory=list)
+    awaited: dict[int, set[str]]
+    outstanding: int
+    gate: int
+    truth: dict[int, Vector] = field(default_factory=dict)
+    early: dict[int, list[tuple[str, Vector, Matrix]]] = field(default_factory=dict)
 
 
 class Collector:
-    """Knows which steps are complete, and the figures of those."""
+    """Knows which steps are complete, and the figures of those.
+
+    completed: steps of which everything has come, in order. estimated: steps of which every estimate has come, which
+    is what lets the clock go on; truth and bounds may follow later.
+    """
 
     def __init__(self, setup: Setup) -> None:
         scenario = setup.scenario
         self._blocks = [lane for lane, _ in setup.blocks]
         self._until = {spec.name: spec.until or scenario.steps for spec in scenario.estimators}
+        self._last_estimate = max(self._until.values(), default=0)
+        self._words = {name: f"estimate of {name}" for name in self._until}
         self._with_bounds = scenario.bounds
-        self._steps = scenario.steps
+        self._count = scenario.steps
         self.estimators = {spec.name: Series(ERROR_FIGURES, scenario.lanes) for spec in scenario.estimators}
         self.bounds = Series(("lower", "upper", "upper_correlated"), scenario.lanes)
         self.completed = 0
+        self.estimated = 0
         self.applied = 0
         """Lane-packets of control that the plant says it applied."""
-        self._pending: dict[int, dict[int, _Pending]] = {}
+        self._steps: dict[int, _Step] = {}
 
     @property
     def finished(self) -> bool:
-        return self.completed == self._steps
+        return self.completed == self._count
 
     def truth(self, step: int, lane: int, arrays: Arrays) -> None:
-        pending = self._of(step, lane)
-        pending.truth = vector_of(arrays["x"])
+        record = self._of(step)
+        x = record.truth[lane] = vector_of(arrays["x"])
         self.applied += int(np.count_nonzero(arrays["nu"]))
-        for name, x_hat, P in pending.estimates:
-            self._reduce(name, step, lane, pending.truth, x_hat, P)
-        pending.estimates.clear()
-        self._done(step, lane, "truth")
+        for name, x_hat, P in record.early.pop(lane, ()):
+            self._reduce(name, step, lane, x, x_hat, P)
+        self._done(record, lane, TRUTH)
 
     def estimate(self, name: str, step: int, lane: int, arrays: Arrays) -> None:
-        pending = self._of(step, lane)
+        record = self._of(step)
         x_hat, P = vector_of(arrays["x_hat"]), matrix_of(arrays["P"])
-        if pending.truth is None:
-            pending.estimates.append((name, x_hat, P))
+        x = record.truth.get(lane)
+        if x is None:
+            record.early.setdefault(lane, []).append((name, x_hat, P))
         else:
-            self._reduce(name, step, lane, pending.truth, x_hat, P)
-        self._done(step, lane, f"estimate of {name}")
+            self._reduce(name, step, lane, x, x_hat, P)
+        record.gate -= 1
+        self._done(record, lane, self._words[name])
 
     def bound(self, step: int, lane: int, arrays: Arrays) -> None:
         figures = {"lower": _component(arrays["trace_lower"])}
@@ -68,38 +79,45 @@ class Collector:
             if f"trace_{name}" in arrays:
                 figures[name] = _component(arrays[f"trace_{name}"])
         self.bounds.add(step, lane, figures)
-        self._of(step, lane)
-        self._done(step, lane, "bounds")
+        self._done(self._of(step), lane, BOUNDS)
 
     def awaiting(self) -> str:
         """What the oldest incomplete step still waits for."""
         step = self.completed + 1
-        awaited: set[str] = set()
-        for lane in self._blocks:
-            awaited |= self._of(step, lane).awaited
+        awaited = set[str]().union(*self._of(step).awaited.values())
         return f"step {step}: {', '.join(sorted(awaited))}"
 
     def _reduce(self, name: str, step: int, lane: int, x: Vector, x_hat: Vector, P: Matrix) -> None:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             self.estimators[name].add(step, lane, error_figures(x, x_hat, P))
 
-    def _of(self, step: int, lane: int) -> _Pending:
-        blocks = self._pending.get(step)
-        if blocks is None:
-            blocks = self._pending[step] = {block: _Pending(self._awaited(step)) for block in self._blocks}
-        return blocks[lane]
+    def _of(self, step: int) -> _Step:
+        record = self._steps.get(step)
+        if record is None:
+            names = {self._words[name] for name, until in self._until.items() if step <= until}
+            parts = names | {TRUTH} | ({BOUNDS} if self._with_bounds else set())
+            blocks = len(self._blocks)
+            awaited = {lane: set(parts) for lane in self._blocks}
+            record = self._steps[step] = _Step(awaited, blocks * len(parts), blocks * len(names))
+        return record
 
-    def _awaited(self, step: int) -> set[str]:
-        names = {f"estimate of {name}" for name, until in self._until.items() if step <= until}
-        return names | {"truth"} | ({"bounds"} if self._with_bounds else set())
-
-    def _done(self, step: int, lane: int, part: str) -> None:
-        self._pending[step][lane].awaited.discard(part)
-        while (blocks := self._pending.get(self.completed + 1)) and not any(b.awaited for b in blocks.values()):
+    def _done(self, record: _Step, lane: int, part: str) -> None:
+        record.awaited[lane].discard(part)
+        record.outstanding -= 1
+        while (following := self._steps.get(self.completed + 1)) is not None and not following.outstanding:
             self.completed += 1
-            del self._pending[self.completed]
+            del self._steps[self.completed]
             for series in (*self.estimators.values(), self.bounds):
                 series.close(self.completed)
+        self.estimated = max(self.estimated, self.completed)
+        while (following := self._steps.get(self.estimated + 1)) is not None and self._estimated(following):
+            self.estimated += 1
+
+    def _estimated(self, record: _Step) -> bool:
+        """Whether all estimates of a step have come; where no estimator runs any more, everything else."""
+        return not record.gate and (
+            not record.outstanding or any(k >= self.estimated + 1 for k in self._until.values())
+        )
 
 
 def _component(array: NDArray[np.float64]) -> Component:

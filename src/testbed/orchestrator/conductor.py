@@ -170,7 +170,7 @@ class Conductor:
     def _advance(self) -> None:
         """Grant the steps that the window allows, several at a time."""
         steps, window = self._steps, self._window
-        target = min(steps, self.collector.completed + window)
+        target = min(steps, self.collector.estimated + window)
         if target > self._granted and (target == steps or target - self._granted >= max(1, window // 4)):
             self._granted = target
             clock = ClockMessage(run=self.setup.run, source=ORCHESTRATOR, seq=self._clock_seq, step=target)

@@ -25,7 +25,7 @@ class PlantService:
         keys = node.keys
         self._plants = {lane: Plant(setup.scenario, lane, lanes) for lane, lanes in setup.blocks}
         self._next = dict.fromkeys(self._plants, 0)
-        self._truth = node.sender(keys.truth, Truth)
+        self._truth = node.sender(keys.truth, Truth, lazy=True)
         self._ack = node.sender(keys.sent("ack"), Acknowledgement, tap=True) if setup.acks_are_of_use else None
         self._observe = node.sender(keys.sent("observation"), Observation, tap=True)
         self.counters: dict[str, int] = {}

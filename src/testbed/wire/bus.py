@@ -23,8 +23,11 @@ class BusError(TestbedError):
 class Bus(Protocol):
     """Handlers run on the thread that calls ``run``, one at a time, in the order of arrival."""
 
-    def publisher(self, key: str) -> Publish:
-        """A function that publishes on ``key``. Order is kept on each key; nothing is lost."""
+    def publisher(self, key: str, *, lazy: bool = False) -> Publish:
+        """A function that publishes on ``key``. Order is kept on each key; nothing is lost.
+
+        lazy: nobody waits for these messages; they may be held back until there are many or nothing else to do.
+        """
         ...
 
     def subscribe(self, key: str, handler: Handler) -> None:

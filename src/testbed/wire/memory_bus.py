@@ -87,7 +87,7 @@ class MemoryBus:
     def deliver_one(self) -> None:
         self.inbox.popleft()()
 
-    def publisher(self, key: str) -> Publish:
+    def publisher(self, key: str, *, lazy: bool = False) -> Publish:
         return partial(self._network._publish, key)
 
     def subscribe(self, key: str, handler: Handler) -> None:

@@ -43,12 +43,15 @@ class Node:
         if name != ORCHESTRATOR:
             self.on(self.keys.command, Command, ORCHESTRATOR, self._obey)
 
-    def sender(self, key: str, model: type[Packet], *, tap: bool = False) -> Send:
-        """A function that publishes packets of one type on one key, numbered; ``tap``: copy them for the recording."""
-        send = _numbered(self.bus.publisher(key), PacketEncoder(model, self.run, self.name))
+    def sender(self, key: str, model: type[Packet], *, tap: bool = False, lazy: bool = False) -> Send:
+        """A function that publishes packets of one type on one key, numbered.
+
+        tap: copy them for the recording. lazy: nothing waits for them (see Bus.publisher).
+        """
+        send = _numbered(self.bus.publisher(key, lazy=lazy), PacketEncoder(model, self.run, self.name))
         if not tap or not self._tap or self._tap >= self.sizes.lanes:
             return send
-        copy = _numbered(self.bus.publisher(self.keys.tap(key)), PacketEncoder(model, self.run, self.name))
+        copy = _numbered(self.bus.publisher(self.keys.tap(key), lazy=True), PacketEncoder(model, self.run, self.name))
         recorded = self._tap
 
         def send_both(step: int, lane: int, lanes: int, arrays: Arrays) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import zenoh
@@ -18,7 +19,17 @@ INBOX_MAX = 65536
 
 _AT_ONCE = 256  # events handled before what they gave rise to is sent
 _BUNDLE_MAX = 64  # messages
+_IDLE_S = 0.02  # without work for so long, lazy messages are sent
 _SMALL = 16_384  # bytes; a larger message does not wait
+
+
+@dataclass
+class _Outgoing:
+    """What waits to be sent on one key."""
+
+    put: Publish
+    waiting: list[bytes]
+    lazy: bool
 
 
 class ZenohBus:
@@ -34,14 +45,15 @@ class ZenohBus:
         self._session, self._deadline_s, self.express = session, deadline_s, express
         self._inbox: queue.SimpleQueue[tuple[Callable[..., None], Any]] = queue.SimpleQueue()
         self._declared: list[Any] = []
-        self._outbox: dict[Publish, list[bytes]] = {}
+        self._outbox: list[_Outgoing] = []
         self._handling = False
 
     def run(self, timeout_s: float) -> bool:
         """Handle what has arrived, waiting up to ``timeout_s`` for the first; False if nothing came."""
         try:
-            handle, event = self._inbox.get(timeout=timeout_s)
+            handle, event = self._inbox.get(timeout=self._patience_s(timeout_s))
         except queue.Empty:
+            self.flush()
             return False
         self._handling = True
         try:
@@ -51,10 +63,14 @@ class ZenohBus:
                 handle(event)
         finally:
             self._handling = False
-            self._flush()
+            self._send(lazy=False)
         return True
 
-    def publisher(self, key: str) -> Publish:
+    def flush(self) -> None:
+        """Send everything that is held back."""
+        self._send(lazy=True)
+
+    def publisher(self, key: str, *, lazy: bool = False) -> Publish:
         publisher = self._session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK,
@@ -64,7 +80,7 @@ class ZenohBus:
         self._declared.append(publisher)
         put: Publish = publisher.put
         waiting: list[bytes] = []
-        self._outbox[put] = waiting
+        self._outbox.append(_Outgoing(put, waiting, lazy))
 
         def publish(payload: bytes) -> None:
             if not self._handling:
@@ -111,13 +127,18 @@ class ZenohBus:
         self._declared.append(liveliness.declare_subscriber(key, self._into_inbox(handle), history=True))
 
     def close(self) -> None:
+        self.flush()
         self._session.close()  # type: ignore[no-untyped-call]
 
-    def _flush(self) -> None:
-        for put, waiting in self._outbox.items():
-            if waiting:
-                put(bundle(waiting))
-                waiting.clear()
+    def _send(self, *, lazy: bool) -> None:
+        for outgoing in self._outbox:
+            if outgoing.waiting and (lazy or not outgoing.lazy):
+                outgoing.put(bundle(outgoing.waiting))
+                outgoing.waiting.clear()
+
+    def _patience_s(self, timeout_s: float) -> float:
+        held_back = any(outgoing.waiting for outgoing in self._outbox)
+        return min(timeout_s, _IDLE_S) if held_back else timeout_s
 
     def _into_inbox(self, handle: Callable[..., None]) -> Any:
         inbox = self._inbox
