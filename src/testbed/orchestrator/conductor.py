@@ -124,10 +124,13 @@ class Conductor:
                 self._record(keys.delivered(link), model, link_role(link), f"{link}/delivered")
 
     def _record(self, key: str, model: type[Packet], source: str, topic: str) -> None:
-        assert self._recorder is not None
         whole = self.setup.tap >= self.setup.sizes.lanes
         taken = key if whole else self.node.keys.tap(key)
-        self.node.on(taken, model, source, partial(self._recorder.write, topic), cut=not whole)
+        self.node.on(taken, model, source, partial(self._write, topic), cut=not whole)
+
+    def _write(self, topic: str, packet: Packet, arrays: Arrays) -> None:
+        if self._recorder is not None:
+            self._recorder.write(topic, packet, arrays, self.node.payload)
 
     def _presence(self, key: str, alive: bool) -> None:
         role = key.rsplit("/", 1)[1]
@@ -163,8 +166,7 @@ class Conductor:
 
     def _collected(self, topic: str, packet: Packet, arrays: Arrays) -> None:
         self.activity += 1
-        if self._recorder is not None:
-            self._recorder.write(topic, packet, arrays)
+        self._write(topic, packet, arrays)
         self._advance()
 
     def _advance(self) -> None:

@@ -33,17 +33,18 @@ class Recorder:
         self._definitions = messages_json_schema()["$defs"]
         self.messages = 0
 
-    def write(self, topic: str, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
-        """Record one packet, cut to the recorded lanes."""
+    def write(self, topic: str, packet: Packet, arrays: dict[str, NDArray[Any]], payload: bytes) -> None:
+        """Record one packet, cut to the recorded lanes; ``payload``: the message as it came."""
         if packet.lane >= self._lanes:
             return
         kept = min(packet.lanes, self._lanes - packet.lane)
         if kept < packet.lanes:
             arrays = {name: array[:kept] for name, array in arrays.items()}
             packet = packet.model_copy(update={"lanes": kept, "arrays": entries_of(arrays)})
+            payload = encode(packet, arrays)
         time_ns = packet.step * self._period_ns
         self._writer.add_message(
-            self._channel(topic, packet.type), time_ns, encode(packet, arrays), time_ns, packet.seq % 2**32
+            self._channel(topic, packet.type), time_ns, payload, time_ns, packet.seq % 2**32
         )
         self.messages += 1
 

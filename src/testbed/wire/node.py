@@ -37,6 +37,8 @@ class Node:
         self.keys = Keys(run)
         self.rejected: Counter[str] = Counter()
         self.stopped = False
+        self.payload = b""
+        """The message that is being handled."""
         self._tap = tap
         self._status_seq = 0
         self._status = bus.publisher(self.keys.status(name))
@@ -100,6 +102,7 @@ class Node:
                 self.rejected[refusal.reason] += 1
                 return
             expected += 1
+            self.payload = payload
             handler(header, arrays)
 
         self.bus.subscribe(key, receive)
