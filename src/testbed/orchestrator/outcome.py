@@ -130,7 +130,7 @@ def between_bounds(
         if bounds is None or figures.kind not in ("aoe", "oe"):
             continue
         steps = [k for k, mean in enumerate(figures.trace_P_mean) if mean is not None]
-        upper, symbol = valid_upper(scenario, bounds)
+        upper, symbol = valid_upper(bounds)
         inside = sum(
             _at_most(bounds.lower_mean[k], figures.trace_P_mean[k]) and _at_most(figures.trace_P_mean[k], upper[k])
             for k in steps
@@ -141,13 +141,12 @@ def between_bounds(
     return checks
 
 
-def valid_upper(scenario: Scenario, bounds: BoundFigures) -> tuple[tuple[float | None, ...], str]:
-    """The upper bound that holds for the scenario's control losses, and its symbol; Nones and "" where none does."""
-    if bounds.upper_correlated_mean is not None:
-        return bounds.upper_correlated_mean, "S (with room for correlated control losses)"
-    if bounds.upper_mean is not None and correlation_factor(chain_of(scenario.links.control.loss)) == 1.0:
-        return bounds.upper_mean, "S"
-    return (None,) * len(bounds.lower_mean), ""
+def valid_upper(bounds: BoundFigures) -> tuple[tuple[float | None, ...], str]:
+    """The upper bound that holds for the control losses, and its name; Nones and "" where none does."""
+    upper = bounds.valid_upper_mean
+    if upper is None:
+        return (None,) * len(bounds.lower_mean), ""
+    return upper, "S" if bounds.upper_correlated_mean is None else "S with room for correlated control losses"
 
 
 def versions() -> dict[str, str]:
@@ -188,13 +187,16 @@ def _bounds(conductor: Conductor) -> BoundFigures | None:
         return None
     lower = {"lower_mean": series.mean["lower"], "lower_stderr": series.stderr["lower"]}
     if control_bound(scenario) is None:
-        reason = "the control is feedback, for which no bound is known"
-        return BoundFigures.model_validate({**lower, "upper_reason": reason})
+        no_bound = "the control is feedback, for which no bound is known"
+        return BoundFigures.model_validate({**lower, "upper_reason": no_bound})
     upper = {"upper_mean": series.mean["upper"], "upper_stderr": series.stderr["upper"]}
     if any(value is not None for value in series.mean["upper_correlated"]):
         upper["upper_correlated_mean"] = series.mean["upper_correlated"]
         upper["upper_correlated_stderr"] = series.stderr["upper_correlated"]
-    return BoundFigures.model_validate({**lower, **upper})
+    reason: str | None = None
+    if correlation_factor(chain_of(scenario.links.control.loss)) is None:
+        reason = "the control losses never mix, and S holds for independent ones"
+    return BoundFigures.model_validate({**lower, **upper, "upper_reason": reason})
 
 
 _SILENT = Status(run="00000000", source="none", seq=0, state="stopped")

@@ -43,9 +43,7 @@ class Recorder:
             packet = packet.model_copy(update={"lanes": kept, "arrays": entries_of(arrays)})
             payload = encode(packet, arrays)
         time_ns = packet.step * self._period_ns
-        self._writer.add_message(
-            self._channel(topic, packet.type), time_ns, payload, time_ns, packet.seq % 2**32
-        )
+        self._writer.add_message(self._channel(topic, packet.type), time_ns, payload, time_ns, packet.seq % 2**32)
         self.messages += 1
 
     def close(self) -> None:

@@ -87,7 +87,14 @@ class BoundFigures(_Model):
         default=None, description="S for Markov control losses: with U (1 + |r|)/(1 − |r|), r = 1 − recovery − failure"
     )
     upper_correlated_stderr: Series | None = None
-    upper_reason: str | None = Field(default=None, description="why there is no upper bound")
+    upper_reason: str | None = Field(default=None, description="why there is no valid upper bound")
+
+    @property
+    def valid_upper_mean(self) -> Series | None:
+        """The upper bound that holds for the control losses of the run, if there is one."""
+        if self.upper_correlated_mean is not None:
+            return self.upper_correlated_mean
+        return self.upper_mean if self.upper_reason is None else None
 
 
 class Transitions(_Model):

@@ -24,6 +24,10 @@ def covariance_csv(summary: Summary) -> str:
         columns["lower_stderr"] = summary.bounds.lower_stderr
         if summary.bounds.upper_mean is not None:
             columns["upper_mean"] = summary.bounds.upper_mean
+        if summary.bounds.upper_correlated_mean is not None:
+            columns["upper_correlated_mean"] = summary.bounds.upper_correlated_mean
+        if summary.bounds.upper_correlated_stderr is not None:
+            columns["upper_correlated_stderr"] = summary.bounds.upper_correlated_stderr
         if summary.bounds.upper_stderr is not None:
             columns["upper_stderr"] = summary.bounds.upper_stderr
     return _along_k(summary.completed_steps, columns)

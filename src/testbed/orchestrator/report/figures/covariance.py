@@ -68,7 +68,11 @@ def choose_scale(summary: Summary) -> Scale:
     traces = [as_vector(e.trace_P_mean) for e in summary.estimators.values()]
     errors = [as_vector(e.squared_error_mean) for e in summary.estimators.values()]
     lower = [as_vector(summary.bounds.lower_mean)] if summary.bounds else []
-    upper = as_vector(summary.bounds.upper_mean) if summary.bounds and summary.bounds.upper_mean else np.array([])
+    upper = (
+        as_vector(summary.bounds.valid_upper_mean)
+        if summary.bounds and summary.bounds.valid_upper_mean
+        else np.array([])
+    )
     top = _largest([*traces, *errors, *lower])
     bottom = _smallest([*traces, *lower])
     if top is None or top <= 0:
@@ -135,8 +139,8 @@ def _draw_bounds(axes: Axes, summary: Summary, k: Vector) -> None:
     end = "_" if len(k) == 1 else ""
     lower = common.every(as_vector(summary.bounds.lower_mean))
     axes.plot(k, lower, color="black", linestyle=common.LOWER_DASH, linewidth=1.0, marker=end, markersize=14, zorder=3)
-    if summary.bounds.upper_mean is not None:
-        upper = common.every(as_vector(summary.bounds.upper_mean))
+    if summary.bounds.valid_upper_mean is not None:
+        upper = common.every(as_vector(summary.bounds.valid_upper_mean))
         axes.plot(
             k, upper, color="black", linestyle=common.UPPER_DASH, linewidth=1.2, marker=end, markersize=14, zorder=3
         )
@@ -159,7 +163,7 @@ def _legends(figure: Figure, summary: Summary, scale: Scale) -> None:
         meanings[r"lower bound $\mathrm{tr}\,\mathrm{E}[P_k^{\mathrm{A}}]$"] = Line2D(
             [], [], color="black", linestyle=common.LOWER_DASH, linewidth=1.0
         )
-    if summary.bounds is not None and summary.bounds.upper_mean is not None:
+    if summary.bounds is not None and summary.bounds.valid_upper_mean is not None:
         away = " (leaves the axes)" if scale.upper_leaves else ""
         meanings[rf"upper bound $\mathrm{{tr}}\,\mathrm{{E}}[S_k]${away}"] = Line2D(
             [], [], color="black", linestyle=common.UPPER_DASH, linewidth=1.2

@@ -41,8 +41,8 @@ def draw_ratios(axes: Axes, summary: Summary, k: Vector) -> None:
             markevery=common.sparse(len(k), index, len(shown)),
         )
     axes.axhline(1.0, color="black", linestyle=common.LOWER_DASH, linewidth=1.0)
-    if summary.bounds is not None and summary.bounds.upper_mean is not None:
-        upper = _ratio(summary.bounds.upper_mean, summary.bounds.lower_mean)
+    if summary.bounds is not None and summary.bounds.valid_upper_mean is not None:
+        upper = _ratio(summary.bounds.valid_upper_mean, summary.bounds.lower_mean)
         axes.plot(k, common.every(upper), color="black", linestyle=common.UPPER_DASH, linewidth=1.2)
         top = float(np.max(upper[np.isfinite(upper)], initial=high))
         high = min(top, high + _UPPER_ROOM * max(high - low, 0.01))
