@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import trustme
+
 from processes.running import ESTIMATORS, children_of, figures_of, finish, free_port, start, summary_of, wait_for
 from processes.running import write_scenario as write
 from testbed.orchestrator.run import Run
@@ -37,7 +38,8 @@ def test_every_role_is_a_process_of_its_own(tmp_path: Path) -> None:
     commands = wait_for(lambda: found if len(found := children_of(process.pid)) == 7 else None)
     process.terminate()
     finish(process)
-    parts = ("plant.controller", "plant --", "--link control", "--link observation", "bounds", "--name aoe", "--name kfio")
+    links = ("--link control", "--link observation")
+    parts = ("plant.controller", "plant --", *links, "bounds", "--name aoe", "--name kfio")
     for part in parts:
         assert sum(part in command for command in commands.values()) == 1, part
 
