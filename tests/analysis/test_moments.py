@@ -97,6 +97,7 @@ def test_a_bernoulli_link_recovers_at_its_arrival_rate(a: float, arrival: float)
     ("recovery", "expected"),
     [
         (0.9, {"finite mean": True, "finite variance": True}),  # 1.4⁴ · 0.1 = 0.38
+        (0.8, {"finite mean": True, "finite variance": True}),  # 1.4⁴ · 0.2 = 0.77
         (0.6, {"finite mean": True, "finite variance": False}),  # 1.4² · 0.4 = 0.78, 1.4⁴ · 0.4 = 1.54
         (0.4, {"finite mean": False}),  # 1.4² · 0.6 = 1.18
     ],

@@ -65,6 +65,8 @@ def test_a_lane_of_a_trace_is_that_lane_of_a_block() -> None:
     for lane in range(6):
         rows = sample_trace(given, "observation", 100, seed=8, lane=lane).rows
         assert [delivered is not None for _, _, delivered in rows] == [bool(mask[lane]) for mask in block]
+    first = sample_trace(given, "observation", 100, seed=8).rows
+    assert first == sample_trace(given, "observation", 100, seed=8, lane=0).rows
 
 
 def test_the_seed_given_is_the_seed_used() -> None:

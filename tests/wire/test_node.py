@@ -210,6 +210,7 @@ _MODELS = {KEYS.sent("control"): Control, KEYS.sent("observation"): Observation}
     [
         (0, []),
         (1, [(0, 1, [0.0]), (0, 1, [10.0])]),
+        (2, [(0, 2, [0.0, 1.0]), (0, 2, [10.0, 11.0])]),
         (3, [(0, 2, [0.0, 1.0]), (2, 1, [2.0]), (0, 2, [10.0, 11.0]), (2, 1, [12.0])]),
         (4, []),  # the whole packets are recorded as they are
     ],
