@@ -27,9 +27,12 @@ _FORMS_MAX = 64
 _NUMBER = rb"(0|[1-9][0-9]{0,17})"
 _VARIABLE = re.compile(
     rb'(\{[^{}]*?"seq":)' + _NUMBER + rb',"step":' + _NUMBER + rb',"lane":' + _NUMBER + rb',"lanes":([1-9][0-9]{0,8})'
-    rb'(,"arrays":[^{}]*\}) *'
+    rb'(,"arrays":[^{}:]*\}) *'
 )
-"""A header as PacketEncoder writes it, cut into what is the same for every packet on a key and what is not."""
+"""A header as PacketEncoder writes it, cut into what is the same for every packet on a key and what is not.
+
+No key follows ``arrays``: of a key that is there twice the last counts.
+"""
 _SMALL = 1024  # bytes up to which copying an array twice costs less than a view of it
 _BLANKS = tuple(b" " * n for n in range(8))
 _PADDING = (b"", b"\0" * 7, b"\0" * 6, b"\0" * 5, b"\0" * 4, b"\0" * 3, b"\0" * 2, b"\0")
