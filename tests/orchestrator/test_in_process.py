@@ -105,6 +105,34 @@ def test_markov_losses_on_both_links(schedule: int | None, tmp_path: Path) -> No
     assert figures(whole) == figures(split)
 
 
+@pytest.mark.parametrize(("lanes_per_packet", "schedule"), [(7, None), (64, 1), (100, 2), (1, None)])
+def test_figures_of_many_lanes_do_not_depend_on_the_packets(
+    lanes_per_packet: int, schedule: int | None, tmp_path: Path
+) -> None:
+    own = {"lanes": 150, "steps": 4, "record": "none", "estimators": [{"name": "aoe"}, {"name": "ff"}, {"name": "oe"}]}
+    whole = run(scenario(**own), tmp_path / "whole")
+    split = run(scenario(transport={"lanes_per_packet": lanes_per_packet}, **own), tmp_path / "split", schedule)
+    assert figures(split) == figures(whole)
+
+
+def test_several_inputs_and_outputs_and_noise_through_G(tmp_path: Path) -> None:
+    system = {
+        "A": [[1.05, 0.1, 0.0], [0.0, 0.9, -0.2], [0.1, 0.0, 0.5]],
+        "B": [[1.0, 0.0], [0.0, 0.0], [-1.0, 2.0]],
+        "C": [[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]],
+        "G": [[1.0], [0.5], [0.0]],
+        "Q": [[0.3]],
+        "R": [[0.5, 0.1], [0.1, 0.4]],
+        "P0": [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 2.0]],
+    }
+    source = {"kind": "uniform", "low": [-1.0, 0.0], "high": [1.0, 3.0]}
+    whole = run(scenario(system=system, input=source), tmp_path / "whole")
+    split = run(scenario(system=system, input=source, transport={"lanes_per_packet": 1}), tmp_path / "split", 1)
+    assert whole.status == "complete"
+    assert figures(split) == figures(whole)
+    assert_equal(recorded(tmp_path / "split", 6, 20), recorded(tmp_path / "whole", 6, 20))
+
+
 def test_a_lane_does_not_depend_on_the_lanes_beside_it(base: tuple[Summary, Recorded], tmp_path: Path) -> None:
     for lanes in (1, 3):
         run(scenario(lanes=lanes), tmp_path)
