@@ -14,11 +14,13 @@ from typing import Any, TypeVar
 
 import zenoh
 
+from testbed.wire.bundle import unbundle
+
 T = TypeVar("T")
 
 SYSTEM = """
 [system]
-A = [[0.9, 0.1], [0.0, 1.05]]
+A = [[0.9, 0.1], [0.0, 0.97]]
 B = [[-1.0], [1.0]]
 C = [[1.0, -1.0], [0.0, 1.0]]
 Q = [[2.0, 0.0], [0.0, 1.0]]
@@ -126,10 +128,10 @@ def wait_for_step(session: zenoh.Session, at_least: int = 1) -> str:
     seen: list[str] = []
 
     def note(sample: zenoh.Sample) -> None:
-        payload = sample.payload.to_bytes()
-        header = json.loads(payload[8 : 8 + int.from_bytes(payload[4:8], "little")])
-        if header["step"] >= at_least:
-            seen.append(str(sample.key_expr))
+        for payload in unbundle(sample.payload.to_bytes()):
+            header = json.loads(payload[8 : 8 + int.from_bytes(payload[4:8], "little")])
+            if header["step"] >= at_least:
+                seen.append(str(sample.key_expr))
 
     subscriber = session.declare_subscriber("testbed/*/estimate/*", note)
     try:

@@ -75,8 +75,8 @@ class LinkService:
         if isinstance(arrived, bool):
             return {self._content: content, "mask": _ARRIVED}
         if not arrived.all():
-            kept = arrived if content.ndim == 1 else arrived[:, None]
-            content = np.where(kept, content, content.dtype.type(0))
+            content = content.copy()
+            content[~arrived] = 0
         return {self._content: content, "mask": arrived.astype(np.uint8)}
 
 

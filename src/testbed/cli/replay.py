@@ -36,7 +36,9 @@ def replay(
     lines = _lines(packets, lane, perfect=spec.acks == "perfect")
     written = []
     try:
-        for line in replay_packets(made, model, read_packets(lines, model), use_acks=spec.acks != "none"):
+        for line in replay_packets(
+            made, model, read_packets(lines, model), use_acks=spec.acks != "none", until=spec.until
+        ):
             if out is None:
                 sys.stdout.write(line + "\n")
             else:

@@ -66,9 +66,16 @@ def _check(line: PacketLine, expected: int, model: Model) -> None:
             raise UsageError(f"acks: got control packet {j} at step {line.k}; allowed: 0 … {line.k - 1}")
 
 
-def replay(estimator: Estimator, model: Model, packets: Iterable[PacketLine], *, use_acks: bool) -> Iterator[str]:
-    """Lines of OUT.jsonl: k, x_hat, P. Raises what the estimator raises, and RunFailed for what is not finite."""
+def replay(
+    estimator: Estimator, model: Model, packets: Iterable[PacketLine], *, use_acks: bool, until: int | None = None
+) -> Iterator[str]:
+    """Lines of OUT.jsonl: k, x_hat, P, up to step ``until``.
+
+    Raises what the estimator raises, and RunFailed for what is not finite.
+    """
     for line in packets:
+        if until is not None and line.k > until:
+            return
         arrived = line.y is not None and line.gamma != 0
         y = line.y if arrived and line.y is not None else [0.0] * model.p
         acks = tuple(Ack(j, np.array([nu]), np.array([1])) for j, nu in line.acks or ()) if use_acks else ()

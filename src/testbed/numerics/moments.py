@@ -4,12 +4,13 @@ A sum of floating-point numbers depends on the order of its terms. Here the orde
 are taken in groups of 64 in a row, each group is summed as a whole, whichever packets brought its lanes, and the
 groups are merged in order with exact sums. Within a group the deviations are taken from the group's own mean, and
 groups are merged by the formula of Chan, Golub and LeVeque (The American Statistician 37, 1983), so that nothing
-cancels.
+cancels. A mean is corrected once by the mean of what is left: equal values have exactly their mean and no spread.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ class LaneMoments:
         groups = -(-lanes // GROUP)
         self._figures, self._lanes = figures, lanes
         self._count = np.zeros((figures, groups))
-        self._sum = np.zeros((figures, groups))
+        self._mean = np.zeros((figures, groups))
         self._squares = np.zeros((figures, groups))
         self._partial: dict[int, tuple[Floats, int]] = {}
 
@@ -52,15 +53,18 @@ class LaneMoments:
 
     def result(self, figure: int) -> tuple[int, float | None, float | None]:
         """(number of values, mean, standard error of the mean); None where there are too few values."""
-        count, total, squares = (a[figure].tolist() for a in (self._count, self._sum, self._squares))
-        n = sum(count)
+        used = self._count[figure] > 0.0
+        count, mean, squares = self._count[figure][used], self._mean[figure][used], self._squares[figure][used]
+        n = count.sum()
         if n == 0:
             return 0, None, None
-        mean = _sum(total) / n
+        with np.errstate(over="ignore", invalid="ignore"):
+            rough = _sum(count * mean) / n
+            centre = rough + _sum(count * (mean - rough)) / n
+            between = count * (mean - centre) * (mean - centre)
         if n < 2:
-            return int(n), mean, None
-        between = [c * (t / c - mean) * (t / c - mean) for c, t in zip(count, total, strict=True) if c]
-        return int(n), mean, math.sqrt((_sum(squares) + _sum(between)) / (n * (n - 1)))
+            return int(n), float(centre), None
+        return int(n), float(centre), math.sqrt((_sum(squares) + _sum(between)) / (n * (n - 1)))
 
     def _gather(self, group: int, offset: int, values: Floats, size: int) -> None:
         buffer, filled = self._partial.pop(group, (None, 0))
@@ -79,27 +83,24 @@ class LaneMoments:
             self._reduce_quietly(group, values)
 
     def _reduce_quietly(self, group: int, values: Floats) -> None:
-        here = slice(group, group + values.shape[1])
-        total = values.sum(axis=2)
-        if np.isfinite(total).all():
-            away = values - (total / values.shape[2])[:, :, None]
-            self._count[:, here] = values.shape[2]
-            self._sum[:, here] = total
-            self._squares[:, here] = np.multiply(away, away, out=away).sum(axis=2)
-            return
-        for figure, row in enumerate(values):
-            for i, lanes in enumerate(row):
-                usable = lanes[np.isfinite(lanes)]
-                count = len(usable)
-                total_here = usable.sum() if count else 0.0
-                self._count[figure, group + i] = count
-                self._sum[figure, group + i] = total_here
-                self._squares[figure, group + i] = np.square(usable - total_here / count).sum() if count else 0.0
+        size = values.shape[2]
+        rough = values.sum(axis=2) / size
+        mean = rough + (values - rough[:, :, None]).sum(axis=2) / size
+        away = values - mean[:, :, None]
+        squares = np.multiply(away, away, out=away).sum(axis=2)
+        self._set((slice(None), slice(group, group + values.shape[1])), size, mean, squares)
+        for figure, i in np.argwhere(~np.isfinite(mean)):
+            usable = values[figure, i][np.isfinite(values[figure, i])]
+            centre = usable.sum() / len(usable) if len(usable) else 0.0
+            self._set((figure, group + i), len(usable), centre, np.square(usable - centre).sum())
+
+    def _set(self, at: Any, count: int, mean: Any, squares: Any) -> None:
+        self._count[at], self._mean[at], self._squares[at] = count, mean, squares
 
 
-def _sum(values: list[float]) -> float:
+def _sum(values: Floats) -> float:
     """The correctly rounded sum; infinite where it overflows."""
     try:
-        return math.fsum(values)
+        return math.fsum(values.tolist())
     except (OverflowError, ValueError):
         return math.inf

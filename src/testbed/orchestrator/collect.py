@@ -23,6 +23,7 @@ class _Step:
     awaited: dict[int, set[str]]
     outstanding: int
     gate: int
+    largest: float = 0.0
     truth: dict[int, Vector] = field(default_factory=dict)
     early: dict[int, list[tuple[str, Vector, Matrix]]] = field(default_factory=dict)
 
@@ -46,6 +47,8 @@ class Collector:
         self.bounds = Series(("lower", "upper", "upper_correlated"), scenario.lanes)
         self.completed = 0
         self.estimated = 0
+        self.largest_state: list[float] = []
+        """The largest |x_k| of any lane and entry, at each completed step."""
         self.applied = 0
         """Lane-packets of control that the plant says it applied."""
         self._steps: dict[int, _Step] = {}
@@ -57,6 +60,7 @@ class Collector:
     def truth(self, step: int, lane: int, arrays: Arrays) -> None:
         record = self._of(step)
         x = record.truth[lane] = vector_of(arrays["x"])
+        record.largest = max(record.largest, float(np.abs(arrays["x"]).max()))
         self.applied += int(np.count_nonzero(arrays["nu"]))
         for name, x_hat, P in record.early.pop(lane, ()):
             self._reduce(name, step, lane, x, x_hat, P)
@@ -107,6 +111,7 @@ class Collector:
         while (following := self._steps.get(self.completed + 1)) is not None and not following.outstanding:
             self.completed += 1
             del self._steps[self.completed]
+            self.largest_state.append(following.largest)
             for series in (*self.estimators.values(), self.bounds):
                 series.close(self.completed)
         self.estimated = max(self.estimated, self.completed)

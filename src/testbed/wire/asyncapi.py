@@ -26,6 +26,12 @@ def asyncapi() -> dict[str, Any]:
         "truth": (keys.truth, "truth", "plant → collector; never for estimators"),
         "estimate": (keys.estimate("{name}"), "estimate", "estimator → collector, and a controller that follows it"),
         "bounds": (keys.bounds, "bounds", "bounds → collector"),
+        "tap": (
+            keys.tap(f"{keys.prefix}/{{link}}/{{end}}"),
+            "observation",
+            "controller, plant and links → recorder: copies of the recorded lanes of what goes over a link "
+            "(control, observation or ack; sent or delivered), where a packet holds more lanes than are recorded",
+        ),
         "status": (keys.status("{role}"), "status", "role → orchestrator, its last word"),
     }
     return {
@@ -45,7 +51,7 @@ def asyncapi() -> dict[str, Any]:
             name: {
                 "address": address,
                 "description": text,
-                "parameters": {p: {} for p in ("run", "name", "role") if "{" + p + "}" in address},
+                "parameters": {p: {} for p in ("run", "name", "role", "link", "end") if "{" + p + "}" in address},
                 "messages": {message: {"$ref": f"#/components/messages/{message}"}},
             }
             for name, (address, message, text) in channels.items()
