@@ -207,11 +207,12 @@ def test_what_an_estimator_refuses_names_the_step() -> None:
         estimates([FIRST, '{"k": 2, "u": [1.0]}'], "oe", max_histories=2)
 
 
+@pytest.mark.parametrize("u", [1.0, 0.0])
 @pytest.mark.parametrize("kind", ["aoe", "ff", "oe"])
-def test_estimates_that_are_no_numbers_are_an_error_and_not_bad_json(kind: str) -> None:
+def test_estimates_that_are_no_numbers_are_an_error_and_not_bad_json(kind: str, u: float) -> None:
     system = {**SYSTEM, "A": [[1e200, 0.0], [0.0, 1.0]]}
     model = model_of(parse_scenario({"system": system, "links": LOSSY}))
-    lines = [json.dumps({"k": k, "u": [1.0]}) for k in range(1, 6)]
+    lines = [json.dumps({"k": k, "u": [u]}) for k in range(1, 6)]
     with pytest.raises(RunFailed, match=r"^step \d: the estimate left the range of floating-point numbers"):
         estimates(lines, kind, model)
 

@@ -424,6 +424,21 @@ def test_a_message_that_the_transport_loses_fails_the_run(tmp_path: Path) -> Non
     assert len(summary.estimators["aoe"].trace_P_mean) == 4
 
 
+def test_an_observation_that_overflows_fails_the_run(tmp_path: Path) -> None:
+    system = {"A": [[1.0]], "C": [[1e300]], "Q": [[1e20]], "R": [[1.0]]}
+    summary = run(parse_scenario({"system": system, "estimators": [{"name": "kfio"}]}), tmp_path)
+    assert summary.status == "failed"
+    assert "left the range of floating-point numbers at step 1" in str(summary.reason)
+
+
+def test_estimators_that_all_end_early_do_not_stop_the_run(tmp_path: Path) -> None:
+    own = [{"name": "aoe", "acks": "none", "until": 5}, {"name": "kfio", "acks": "perfect", "until": 2}]
+    for window in (1, 3):
+        summary = run(scenario(estimators=own, clock={"window": window}), tmp_path)
+        assert (summary.status, summary.completed_steps) == ("complete", 20)
+        assert [mean is None for mean in summary.estimators["aoe"].trace_P_mean] == [False] * 5 + [True] * 15
+
+
 def test_a_state_that_overflows_fails_the_run(tmp_path: Path) -> None:
     system = {"A": [[1e100]], "C": [[1.0]], "Q": [[1.0]], "R": [[1.0]]}
     own = {"system": system, "steps": 9, "links": {"observation": {"loss": {"kind": "bernoulli", "arrival": 0.0}}}}
