@@ -128,7 +128,7 @@ def test_the_first_packet_follows_start(start: float) -> None:
     assert stats.binomtest(int(bits[1].sum()), 40_000, second).pvalue > LEVEL
 
 
-@pytest.mark.parametrize("lanes", [1, 5])
+@pytest.mark.parametrize("lanes", [1, 2, 5])
 @pytest.mark.parametrize(
     ("chain", "expected"),
     [
@@ -143,6 +143,8 @@ def test_the_first_packet_follows_start(start: float) -> None:
 )
 def test_certain_fates(chain: Chain, expected: bool, lanes: int) -> None:
     np.testing.assert_array_equal(fates(chain, 1000, lanes=lanes), expected)
+    mask = LossProcess(chain, Stream(1, "link.test", "loss", width=1, lane=0, lanes=lanes), lanes).next(0)
+    assert isinstance(mask, bool) if lanes == 1 else mask.shape == (lanes,)
 
 
 def test_a_chain_that_only_recovers_never_loses_again() -> None:

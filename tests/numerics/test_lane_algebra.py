@@ -171,7 +171,7 @@ def test_a_matrix_that_is_not_definite_spoils_its_own_lane_only() -> None:
     assert math.isnan(la.Cholesky(la.matrix_of(P[1:2])).quadratic(la.vector_of(b[1:2])))
 
 
-@pytest.mark.parametrize("lanes", [1, 4])
+@pytest.mark.parametrize("lanes", [1, 2, 4])
 def test_conversions_keep_shape_and_values(lanes: int) -> None:
     rng = np.random.default_rng(5)
     x, P = rng.normal(size=(lanes, 3)), rng.normal(size=(lanes, 2, 3))

@@ -431,6 +431,15 @@ def test_an_observation_that_overflows_fails_the_run(tmp_path: Path) -> None:
     assert "left the range of floating-point numbers at step 1" in str(summary.reason)
 
 
+def test_an_estimate_that_overflows_fails_the_run(tmp_path: Path) -> None:
+    system = {"A": [[1e10]], "C": [[1.0]], "Q": [[1.0]], "R": [[1.0]], "P0": [[1e300]]}
+    lost = {"observation": {"loss": {"kind": "bernoulli", "arrival": 0.0}}}
+    own = {"system": system, "links": lost, "steps": 3, "bounds": False}
+    summary = run(parse_scenario({**own, "estimators": [{"name": "kfio"}]}), tmp_path)
+    assert summary.status == "failed"
+    assert summary.reason == "the estimate of 'kfio' left the range of floating-point numbers at step 1"
+
+
 def test_estimators_that_all_end_early_do_not_stop_the_run(tmp_path: Path) -> None:
     own = [{"name": "aoe", "acks": "none", "until": 5}, {"name": "kfio", "acks": "perfect", "until": 2}]
     for window in (1, 3):

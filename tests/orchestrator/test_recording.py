@@ -138,11 +138,12 @@ def test_lines_hold_what_the_estimators_received(made: RunOf) -> None:
             assert line["acks"] == ([[i, int(record["truth"]["nu"][i, lane])]] if known else [])
 
 
-@pytest.mark.parametrize("lanes_per_packet", [None, 1, 2])
-def test_the_first_lane_alone_is_the_first_of_all(lanes_per_packet: int | None, tmp_path: Path) -> None:
-    transport = {} if lanes_per_packet is None else {"lanes_per_packet": lanes_per_packet}
-    run(scenario(transport=transport), tmp_path / "all")
-    run(scenario(transport=transport, record="first"), tmp_path / "first")
+@pytest.mark.parametrize("variant", ["all estimators", "closed loop"])
+@pytest.mark.parametrize("lanes_per_packet", [6, 1, 2])
+def test_the_first_lane_alone_is_the_first_of_all(lanes_per_packet: int, variant: str, tmp_path: Path) -> None:
+    own = {"transport": {"lanes_per_packet": lanes_per_packet}, **VARIANTS[variant]}
+    run(scenario(**own), tmp_path / "all")
+    run(scenario(record="first", **own), tmp_path / "first")
     whole, first = recorded(tmp_path / "all", 6, 20), recorded(tmp_path / "first", 1, 20)
     assert whole.keys() == first.keys()
     for topic, arrays in first.items():

@@ -117,6 +117,8 @@ def test_the_last_packet_of_a_step_may_be_smaller() -> None:
 
 
 def test_needed_arrays_must_be_there() -> None:
+    for needs in ((), ("y",), ("y", "mask")):
+        assert not Bench(needs=needs).send(packet(0, 1))
     bench = Bench(needs=("y",))
     bare = PacketEncoder(Observation, RUN, "link.observation")
     assert bench.send(bare.encode(0, 1, 0, 2, {"mask": np.zeros(2, dtype=np.uint8)})) == {"arrays": 1}
