@@ -43,7 +43,7 @@ def run_floor(scenario: Scenario) -> Floor:
     estimator = create(spec.kind, model, lanes=lanes, options=spec.options)
     bounds = Bounds(model, control_bound(scenario), lanes) if scenario.bounds else None
     source = open_loop(scenario, 0, lanes)
-    series, bound_series = Series(ERROR_FIGURES), Series(("lower", "upper"))
+    series, bound_series = Series(ERROR_FIGURES, lanes), Series(("lower", "upper"), lanes)
     parts: dict[str, float] = defaultdict(float)
     begun = last = time.perf_counter()
 

@@ -5,7 +5,6 @@ For i.i.d. control losses it is the same estimator as GPB1 and IMM.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
 
@@ -27,13 +26,13 @@ from testbed.numerics.lanes import (
     exp,
     full,
     mask_of,
-    one_lane,
     scale,
     subtract,
     vector_of,
     where,
     where_vector,
 )
+from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 _Weights = tuple[Component, Component]
@@ -45,6 +44,7 @@ class Aoe:
 
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
+        self._advance = _stepper(model, lanes)
         self._x, self._p = model.prior(lanes)
         self._posterior: _Weights | None = None  # of the last ν
         self._k = 0
@@ -54,9 +54,8 @@ class Aoe:
         """An ACK of ν_{k−1} decides between the hypotheses; older ones come too late and are counted."""
         gamma = mask_of(arrived)
         self._k += 1
-        advance = _one_lane(self._model, gamma) if isinstance(gamma, bool) else partial(_advance, self._model, gamma)
         weights = self._prior_weights(acks)
-        self._x, self._p, *posterior = advance(self._x, self._p, *weights, vector_of(u), vector_of(y))
+        self._x, self._p, *posterior = self._advance(gamma, self._x, self._p, *weights, vector_of(u), vector_of(y))
         self._posterior = posterior[0], posterior[1]
         return Estimate(self._x, self._p, self._lanes)
 
@@ -97,9 +96,9 @@ def _advance(
 
 
 @lru_cache(maxsize=16)
-def _one_lane(model: Model, gamma: bool) -> Callable[..., tuple[Any, ...]]:
+def _stepper(model: Model, lanes: int) -> Step:
     state: tuple[Shape, ...] = (("vector", model.n), ("symmetric", model.n), ("scalar", 1), ("scalar", 1))
-    return one_lane(partial(_advance, model, gamma), (*state, ("vector", model.q), ("vector", model.p)), state)
+    return masked_step(partial(_advance, model), (*state, ("vector", model.q), ("vector", model.p)), state, lanes)
 
 
 def _bayes(weights: _Weights, odds: Component) -> _Weights:

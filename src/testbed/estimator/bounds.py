@@ -9,7 +9,6 @@ is enough for the best estimator; that is the *correlated* upper bound here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
 
@@ -18,7 +17,8 @@ from numpy.typing import NDArray
 from testbed.channel.loss import Chain
 from testbed.estimator.model import Model
 from testbed.estimator.riccati import Gain, phi, predict
-from testbed.numerics.lanes import Constant, Floats, Mask, Matrix, constant, mask_of, matrices_of, one_lane
+from testbed.numerics.lanes import Constant, Floats, Mask, Matrix, constant, mask_of, matrices_of
+from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 
@@ -50,10 +50,8 @@ class Bounds:
         return self._lower, self._upper
 
     def _next(self, P: Matrix, noise: Constant, gamma: Mask) -> Matrix:
-        if not isinstance(gamma, bool):
-            return _advance(self._model, noise, gamma, P)[0]
-        advanced: Matrix = _one_lane(self._model, noise, gamma)(P)[0]
-        return advanced
+        (advanced,) = _stepper(self._model, noise, self._lanes)(gamma, P)
+        return advanced  # type: ignore[no-any-return]
 
 
 def _advance(model: Model, noise: Constant, gamma: Mask, P: Matrix) -> tuple[Matrix]:
@@ -63,6 +61,6 @@ def _advance(model: Model, noise: Constant, gamma: Mask, P: Matrix) -> tuple[Mat
 
 
 @lru_cache(maxsize=16)
-def _one_lane(model: Model, noise: Constant, gamma: bool) -> Callable[..., tuple[Matrix]]:
+def _stepper(model: Model, noise: Constant, lanes: int) -> Step:
     shape: tuple[Shape, ...] = (("symmetric", model.n),)
-    return one_lane(partial(_advance, model, noise, gamma), shape, shape)
+    return masked_step(partial(_advance, model, noise), shape, shape, lanes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
 
@@ -22,13 +21,13 @@ from testbed.numerics.lanes import (
     any_of,
     constant_times,
     mask_of,
-    one_lane,
     scale,
     vector_of,
     where,
     where_symmetric,
     where_vector,
 )
+from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 
@@ -42,6 +41,7 @@ class Ff:
         if not model.control.independent:
             raise UsageError("estimator 'ff' holds for i.i.d. control losses only; for Markov losses use 'aoe' or 'oe'")
         self._model, self._lanes = model, lanes
+        self._advance = _stepper(model, lanes)
         self._x, self._p = model.prior(lanes)
         self._ack_p = self._p
         self._k = 0
@@ -49,11 +49,10 @@ class Ff:
 
     def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
         """Older ACKs than that of ν_{k−1} cannot be used and are counted."""
-        model, gamma = self._model, mask_of(arrived)
+        gamma = mask_of(arrived)
         self._k += 1
-        advance = _one_lane(model, gamma) if isinstance(gamma, bool) else partial(_advance, model, gamma)
         given = self._rate(acks), vector_of(u), vector_of(y)
-        self._x, self._p, self._ack_p = advance(self._x, self._p, self._ack_p, *given)
+        self._x, self._p, self._ack_p = self._advance(gamma, self._x, self._p, self._ack_p, *given)
         return Estimate(self._x, self._p, self._lanes)
 
     def _rate(self, acks: tuple[Ack, ...]) -> Component:
@@ -81,7 +80,7 @@ def _advance(
 
 
 @lru_cache(maxsize=16)
-def _one_lane(model: Model, gamma: bool) -> Callable[..., tuple[Any, ...]]:
+def _stepper(model: Model, lanes: int) -> Step:
     state: tuple[Shape, ...] = (("vector", model.n), ("symmetric", model.n), ("symmetric", model.n))
     given: tuple[Shape, ...] = (("scalar", 1), ("vector", model.q), ("vector", model.p))
-    return one_lane(partial(_advance, model, gamma), (*state, *given), state)
+    return masked_step(partial(_advance, model), (*state, *given), state, lanes)

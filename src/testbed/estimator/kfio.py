@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
 
@@ -24,11 +23,11 @@ from testbed.numerics.lanes import (
     any_of,
     constant_times,
     mask_of,
-    one_lane,
     scale,
     vector_of,
     where_vector,
 )
+from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 from testbed.scenario import ConstantInput, Input, NoLoss, Scenario
 
@@ -41,6 +40,7 @@ class Kfio:
 
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
+        self._advance = _stepper(model, lanes)
         self._x, self._p = model.prior(lanes)
         self._k = 0
         self.counters: dict[str, int] = {}
@@ -61,8 +61,7 @@ class Kfio:
         self._k += 1
         push = model.control_effect(vector_of(u)) if model.q else [0.0] * model.n
         nu = self._nu(push, acks)
-        advance = _one_lane(model, gamma) if isinstance(gamma, bool) else partial(_advance, model, gamma)
-        self._x, self._p = advance(self._x, self._p, push, nu, vector_of(y))
+        self._x, self._p = self._advance(gamma, self._x, self._p, push, nu, vector_of(y))
         return Estimate(self._x, self._p, self._lanes)
 
     def _nu(self, push: Vector, acks: tuple[Ack, ...]) -> Component:
@@ -93,10 +92,10 @@ def _advance(
 
 
 @lru_cache(maxsize=16)
-def _one_lane(model: Model, gamma: bool) -> Callable[..., tuple[Any, ...]]:
+def _stepper(model: Model, lanes: int) -> Step:
     state: tuple[Shape, ...] = (("vector", model.n), ("symmetric", model.n))
     given: tuple[Shape, ...] = (("vector", model.n), ("scalar", 1), ("vector", model.p))
-    return one_lane(partial(_advance, model, gamma), (*state, *given), state)
+    return masked_step(partial(_advance, model), (*state, *given), state, lanes)
 
 
 def _zero(source: Input | None) -> bool:

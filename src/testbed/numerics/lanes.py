@@ -18,6 +18,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.numerics.kernels import LANES_MIN, available, kernel
 from testbed.numerics.symbols import Shape, Symbol, straight_line
 
 _STRAIGHT_MAX = 8  # order of the largest matrix for which code is written out
@@ -95,19 +96,19 @@ def mask_of(array: NDArray[Any]) -> Mask:
 def where(mask: Mask, a: Component, b: Component) -> Component:
     if isinstance(mask, bool):
         return a if mask else b
-    return np.where(mask, a, b)
+    return mask.apply("where", a, b) if isinstance(mask, Symbol) else np.where(mask, a, b)
 
 
 def where_vector(mask: Mask, a: Vector, b: Vector) -> Vector:
     if isinstance(mask, bool):
         return a if mask else b
-    return [np.where(mask, x, y) for x, y in zip(a, b, strict=True)]
+    return [where(mask, x, y) for x, y in zip(a, b, strict=True)]
 
 
 def where_symmetric(mask: Mask, a: Matrix, b: Matrix) -> Matrix:
     if isinstance(mask, bool):
         return a if mask else b
-    return symmetric(len(a), lambda i, j: np.where(mask, a[i][j], b[i][j]))
+    return symmetric(len(a), lambda i, j: where(mask, a[i][j], b[i][j]))
 
 
 def all_of(mask: Mask) -> bool:
@@ -115,6 +116,8 @@ def all_of(mask: Mask) -> bool:
 
 
 def any_of(mask: Mask) -> bool:
+    if isinstance(mask, Symbol):
+        return True  # what may be observed in some lane is computed for all
     return mask if isinstance(mask, bool) else bool(mask.any())
 
 
@@ -236,6 +239,15 @@ def one_lane(
         return cast(Callable[..., tuple[Any, ...]], function)
     calls: dict[str, Callable[..., Any]] = {"sqrt": sqrt, "reciprocal": reciprocal, "exp": exp, "clip": clip}
     return straight_line(function, arguments, results, calls)
+
+
+def many_lanes(
+    function: Callable[..., Sequence[Any]], arguments: Sequence[Shape], results: Sequence[Shape], lanes: int
+) -> Callable[..., tuple[Any, ...]]:
+    """``function`` for many lanes: compiled where that is possible and pays, to the same bits; else itself."""
+    if lanes < LANES_MIN or max(n for _, n in arguments) > _STRAIGHT_MAX or not available():
+        return cast(Callable[..., tuple[Any, ...]], function)
+    return kernel(function, arguments, results, {"exp": exp})
 
 
 class Cholesky:

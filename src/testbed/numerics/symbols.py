@@ -1,4 +1,4 @@
-"""Straight-line code from a function of components, for one lane.
+"""Programs written down from a function of components.
 
 A step of a filter on one lane is a few hundred multiplications and additions; done through lists and small functions,
 finding the operands costs ten times the arithmetic. So the function is run once on symbols that write down every
@@ -7,12 +7,15 @@ operation, and what they wrote is compiled: the same operations in the same orde
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
-Kind = Literal["scalar", "vector", "symmetric"]
+Kind = Literal["scalar", "vector", "symmetric", "mask"]
 Shape = tuple[Kind, int]
-"""What one argument or result is: a component, a vector of n, or a symmetric n × n matrix."""
+"""What one argument or result is: a component, a vector of n, a symmetric n × n matrix, or a mask."""
+
+_NAME = re.compile(r"\b[at][0-9]+\b")
 
 
 class Symbol:
@@ -20,7 +23,7 @@ class Symbol:
 
     __slots__ = ("name", "program")
 
-    def __init__(self, program: _Program, name: str) -> None:
+    def __init__(self, program: Program, name: str) -> None:
         self.program, self.name = program, name
 
     def apply(self, function: str, *arguments: object) -> Symbol:
@@ -52,19 +55,80 @@ class Symbol:
         raise TypeError("a decision cannot depend on a symbol")
 
 
-class _Program:
-    """The operations in the order they were done, each once."""
+class Program:
+    """What a function did to symbols: each operation once, in order; and how its arguments and results are laid out."""
 
     def __init__(self) -> None:
         self.lines: list[tuple[str, str]] = []
+        self.inputs: list[str] = []
+        self.kinds: list[Kind] = []
+        self.outputs: list[str] = []
         self._known: dict[str, Symbol] = {}
+        self._arguments: tuple[Shape, ...] = ()
+        self._results: tuple[Shape, ...] = ()
 
     def note(self, expression: str) -> Symbol:
+        """The symbol of an operation; the same one if the operation was done before."""
         symbol = self._known.get(expression)
         if symbol is None:
             symbol = self._known[expression] = Symbol(self, f"t{len(self.lines)}")
             self.lines.append((symbol.name, expression))
         return symbol
+
+    def take(self, shapes: Sequence[Shape]) -> list[Any]:
+        """Arguments made of fresh symbols."""
+        self._arguments = tuple(shapes)
+        out = []
+        for shape in shapes:
+            fresh = [f"a{len(self.inputs) + i}" for i in range(_size(shape))]
+            self.inputs += fresh
+            self.kinds += [shape[0]] * len(fresh)
+            out.append(_unflat([Symbol(self, name) for name in fresh], shape))
+        return out
+
+    def give(self, values: Sequence[Any], shapes: Sequence[Shape]) -> None:
+        """Note the results."""
+        self._results = tuple(shapes)
+        for value, shape in zip(values, shapes, strict=True):
+            self.outputs += map(_written, _flat(value, shape))
+        self._drop_unused()
+
+    def flatten(self, values: Sequence[Any]) -> list[Any]:
+        """The components of arguments in the order of ``inputs``."""
+        flat: list[Any] = []
+        for value, shape in zip(values, self._arguments, strict=True):
+            flat += _flat(value, shape)
+        return flat
+
+    def unflatten(self, flat: Sequence[Any]) -> tuple[Any, ...]:
+        """Results from components in the order of ``outputs``; a component that is a text is a constant."""
+        out, position = [], 0
+        for shape in self._results:
+            size = _size(shape)
+            part = [float(v.strip("()")) if isinstance(v, str) else v for v in flat[position : position + size]]
+            out.append(_unflat(part, shape))
+            position += size
+        return tuple(out)
+
+    @staticmethod
+    def names_in(expression: str) -> list[str]:
+        """The names of symbols in an expression."""
+        return _NAME.findall(expression)
+
+    def _drop_unused(self) -> None:
+        needed, kept = set(self.outputs), []
+        for name, expression in reversed(self.lines):
+            if name in needed:
+                kept.append((name, expression))
+                needed.update(self.names_in(expression))
+        self.lines = kept[::-1]
+
+
+def traced(function: Callable[..., Sequence[Any]], arguments: Sequence[Shape], results: Sequence[Shape]) -> Program:
+    """Run a function on symbols."""
+    program = Program()
+    program.give(function(*program.take(arguments)), results)
+    return program
 
 
 def straight_line(
@@ -77,27 +141,15 @@ def straight_line(
 
     functions: what ``Symbol.apply`` may call, by name.
     """
-    program = _Program()
-    names: list[str] = []
-    symbols = []
-    for shape in arguments:
-        count = _size(shape)
-        fresh = [f"a{len(names) + i}" for i in range(count)]
-        names += fresh
-        symbols.append(_unflat([Symbol(program, name) for name in fresh], shape))
-    outcome = [_flat(value, shape) for value, shape in zip(function(*symbols), results, strict=True)]
-    returned = ", ".join("(" + ", ".join(map(_written, flat)) + ",)" for flat in outcome)
+    program = traced(function, arguments, results)
     body = "".join(f"    {name} = {expression}\n" for name, expression in program.lines)
     namespace: dict[str, Any] = dict(functions)
-    exec(f"def compiled({', '.join(names)}):\n{body}    return ({returned},)\n", namespace)
-    compiled = namespace["compiled"]
-    argument_shapes, result_shapes = tuple(arguments), tuple(results)
+    returned = ", ".join(program.outputs)
+    exec(f"def compiled({', '.join(program.inputs)}):\n{body}    return ({returned},)\n", namespace)
+    compiled, flatten, unflatten = namespace["compiled"], program.flatten, program.unflatten
 
     def run(*values: Any) -> tuple[Any, ...]:
-        flat: list[float] = []
-        for value, shape in zip(values, argument_shapes, strict=True):
-            flat += _flat(value, shape)
-        return tuple([_unflat(out, shape) for out, shape in zip(compiled(*flat), result_shapes, strict=True)])
+        return unflatten(compiled(*flatten(values)))
 
     return run
 
@@ -112,12 +164,12 @@ def _written(operand: object) -> str:
 
 def _size(shape: Shape) -> int:
     kind, n = shape
-    return 1 if kind == "scalar" else n if kind == "vector" else n * (n + 1) // 2
+    return 1 if kind in ("scalar", "mask") else n if kind == "vector" else n * (n + 1) // 2
 
 
 def _flat(value: Any, shape: Shape) -> list[Any]:
     kind, n = shape
-    if kind == "scalar":
+    if kind in ("scalar", "mask"):
         return [value]
     if kind == "vector":
         return value  # type: ignore[no-any-return]
@@ -126,7 +178,7 @@ def _flat(value: Any, shape: Shape) -> list[Any]:
 
 def _unflat(flat: Sequence[Any], shape: Shape) -> Any:
     kind, n = shape
-    if kind == "scalar":
+    if kind in ("scalar", "mask"):
         return flat[0]
     if kind == "vector":
         return list(flat)

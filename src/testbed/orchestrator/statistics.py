@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import gammaincinv
 
-from testbed.numerics.lanes import Cholesky, Component, Matrix, Vector, dot, one_lane, subtract, trace
+from testbed.numerics.lanes import Cholesky, Component, Matrix, Vector, dot, many_lanes, one_lane, subtract, trace
 from testbed.numerics.moments import LaneMoments
 from testbed.numerics.symbols import Shape
 
@@ -19,7 +19,8 @@ Figures = dict[str, Component]
 
 def error_figures(x: Vector, x_hat: Vector, P: Matrix) -> Figures:
     """tr P, ‖x − x̂‖², (x − x̂)' P⁻¹ (x − x̂) and ‖x − x̂‖² − tr P of every lane."""
-    compute = _one_lane(len(x)) if isinstance(x[0], float) else _figures
+    lanes = 1 if isinstance(x[0], float) else len(x[0])
+    compute = _compute(len(x), lanes)
     return dict(zip(ERROR_FIGURES, compute(x, x_hat, P), strict=True))
 
 
@@ -30,9 +31,12 @@ def _figures(x: Vector, x_hat: Vector, P: Matrix) -> tuple[Component, ...]:
 
 
 @lru_cache
-def _one_lane(n: int) -> Callable[..., tuple[Component, ...]]:
+def _compute(n: int, lanes: int) -> Callable[..., tuple[Component, ...]]:
     arguments: tuple[Shape, ...] = (("vector", n), ("vector", n), ("symmetric", n))
-    return one_lane(_figures, arguments, (("scalar", 1),) * len(ERROR_FIGURES))
+    results: tuple[Shape, ...] = (("scalar", 1),) * len(ERROR_FIGURES)
+    if lanes == 1:
+        return one_lane(_figures, arguments, results)
+    return many_lanes(_figures, arguments, results, lanes)
 
 
 def nees_band_95(n: int, lanes: int) -> tuple[float, float]:

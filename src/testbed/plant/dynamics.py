@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +18,10 @@ from testbed.numerics.lanes import (
     array_of,
     constant,
     constant_times,
-    one_lane,
     vector_of,
     where,
 )
+from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.streams import Stream
 from testbed.numerics.symbols import Shape
 from testbed.scenario import Scenario, System
@@ -44,6 +42,7 @@ class Plant:
     def __init__(self, scenario: Scenario, lane: int, lanes: int) -> None:
         system = scenario.system
         self._lanes, self._matrices = lanes, _matrices(scenario.system)
+        self._advance = _stepper(self._matrices, lanes)
 
         def stream(purpose: str, width: int) -> Stream:
             return Stream(scenario.seed, "plant", purpose, width=width, lane=lane, lanes=lanes)
@@ -55,12 +54,9 @@ class Plant:
 
     def move(self, u: Floats | None, applied: Mask) -> tuple[Floats, Floats]:
         """One step: apply u (M, q) where ``applied``, zero elsewhere. Returns x_{k+1} (M, n) and y_{k+1} (M, p)."""
-        if u is None:
-            applied = False
-        advance = _one_lane(self._matrices, applied) if self._lanes == 1 else partial(_advance, self._matrices, applied)
         control = [0.0] * self._matrices.q if u is None else vector_of(u)
         w, v = self._process.normals(self._k), self._sensor.normals(self._k + 1)
-        self.x, y = advance(self.x, control, w, v)
+        self.x, y = self._advance(applied, self.x, control, w, v)
         self._k += 1
         return array_of(self.x, self._lanes), array_of(y, self._lanes)
 
@@ -94,13 +90,12 @@ def _advance(m: _Matrices, applied: Mask, x: Vector, u: Vector, w: Vector, v: Ve
     return x, add(constant_times(m.c, x), constant_times(m.sensor, v))
 
 
-@lru_cache(maxsize=32)
-def _one_lane(m: _Matrices, applied: bool) -> Callable[..., tuple[Any, ...]]:
+@lru_cache(maxsize=16)
+def _stepper(m: _Matrices, lanes: int) -> Step:
     n, p = len(m.a), len(m.c)
-    noises: tuple[Shape, ...] = (("vector", len(m.process[0])), ("vector", p))
-    return one_lane(
-        partial(_advance, m, applied), (("vector", n), ("vector", m.q), *noises), (("vector", n), ("vector", p))
-    )
+    arguments: tuple[Shape, ...] = (("vector", n), ("vector", m.q), ("vector", len(m.process[0])), ("vector", p))
+    results: tuple[Shape, ...] = (("vector", n), ("vector", p))
+    return masked_step(partial(_advance, m), arguments, results, lanes)
 
 
 def bits(mask: Mask) -> NDArray[np.uint8]:
