@@ -37,8 +37,7 @@ class BoundsService:
         node.on(node.keys.delivered("observation"), Observation, "link.observation", self._take, needs=("mask",))
 
     def _take(self, packet: Observation, arrays: dict[str, NDArray[Any]]) -> None:
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            lower, upper = self._blocks[packet.lane].components(arrays["mask"])
+        lower, upper = self._blocks[packet.lane].components(arrays["mask"])
         traces = {"trace_lower": _lanes(trace(lower), packet.lanes)}
         if upper is not None:
             traces["trace_upper"] = _lanes(trace(upper), packet.lanes)

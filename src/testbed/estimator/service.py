@@ -97,8 +97,7 @@ class EstimatorService:
         block = self._blocks[lane]
         observation = parts["y"]
         y: Floats = observation["y"] if "y" in observation else np.zeros((block.lanes, self._model.p))
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            estimate = block.estimator.step(parts["u"]["u"], y, observation["mask"], _acks(step, parts.get("ack")))
+        estimate = block.estimator.step(parts["u"]["u"], y, observation["mask"], _acks(step, parts.get("ack")))
         x_hat, P = estimate.x_hat, estimate.P
         if not (all_finite(x_hat.ravel()) and all_finite(P.ravel())):
             raise RunFailed(f"the estimate of '{self._name}' left the range of floating-point numbers at step {step}")

@@ -60,7 +60,8 @@ class Collector:
     def truth(self, step: int, lane: int, arrays: Arrays) -> None:
         record = self._of(step)
         x = record.truth[lane] = vector_of(arrays["x"])
-        record.largest = max(record.largest, float(np.abs(arrays["x"]).max()))
+        largest = max(map(abs, x)) if isinstance(x[0], float) else float(np.abs(arrays["x"]).max())
+        record.largest = max(record.largest, largest)
         self.applied += int(np.count_nonzero(arrays["nu"]))
         for name, x_hat, P in record.early.pop(lane, ()):
             self._reduce(name, step, lane, x, x_hat, P)
@@ -92,8 +93,7 @@ class Collector:
         return f"step {step}: {', '.join(sorted(awaited))}"
 
     def _reduce(self, name: str, step: int, lane: int, x: Vector, x_hat: Vector, P: Matrix) -> None:
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            self.estimators[name].add(step, lane, error_figures(x, x_hat, P))
+        self.estimators[name].add(step, lane, error_figures(x, x_hat, P))
 
     def _of(self, step: int) -> _Step:
         record = self._steps.get(step)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import secrets
 import shlex
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
 from testbed.orchestrator.conductor import Conductor
@@ -21,6 +25,7 @@ from testbed.orchestrator.supervise import Supervisor, command_of
 from testbed.scenario import Scenario, to_toml
 from testbed.wire.memory_bus import MemoryNetwork
 from testbed.wire.node import Node
+from testbed.wire.process import settle_memory
 from testbed.wire.setup import Role, Setup
 
 _POLL_S = 0.1
@@ -54,6 +59,7 @@ class Run:
         self._started_s: float | None = None
         self._reported = 0
 
+    @np.errstate(all="ignore")  # what is not finite has no figure, and is counted
     def over_zenoh(self, external: Sequence[str] = ()) -> Summary:
         """Across real processes; ``external`` names the roles that somebody starts by hand.
 
@@ -83,7 +89,8 @@ class Run:
                         self._say(f"start {role.name} by hand: {shlex.join(self._by_hand(role, endpoint))}")
                     else:
                         supervisor.start(role, endpoint, self._setup.run, transport)
-                self._drive(conductor, bus, supervisor, patient=bool(external))
+                with _settled_memory():
+                    self._drive(conductor, bus, supervisor, patient=bool(external))
             except KeyboardInterrupt:
                 interrupted = True
             self._settle(conductor, bus)
@@ -95,6 +102,7 @@ class Run:
                 recorder.close()
             session.close()  # type: ignore[no-untyped-call]
 
+    @np.errstate(all="ignore")
     def in_process(self, schedule: int | None = None) -> Summary:
         """On the in-process bus; ``schedule`` seeds the order in which messages to different roles are delivered."""
         network = MemoryNetwork(schedule)
@@ -229,6 +237,18 @@ def write_results(out: Path, summary: Summary, scenario: Scenario) -> None:
         write_report(out / "report.html", summary, toml)
     except OSError as error:
         raise RunFailed(f"cannot write the results into {out}: {error.strerror}") from None
+
+
+@contextmanager
+def _settled_memory() -> Iterator[None]:
+    """As in the roles, and as it was afterwards."""
+    before = gc.get_threshold()
+    settle_memory()
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+        gc.unfreeze()
 
 
 def _import_report() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from testbed.errors import RunFailed
@@ -34,8 +33,7 @@ class PlantService:
     def _move(self, packet: Control, arrays: dict[str, NDArray[Any]]) -> None:
         lane, lanes, step = packet.lane, packet.lanes, packet.step + 1
         applied = mask_of(arrays["mask"])
-        with np.errstate(over="ignore", invalid="ignore"):
-            x, y = self._plants[lane].move(arrays.get("u"), applied)
+        x, y = self._plants[lane].move(arrays.get("u"), applied)
         if not (all_finite(x.ravel()) and all_finite(y.ravel())):
             raise RunFailed(f"the state left the range of floating-point numbers at step {step}")
         nu = bits(applied)

@@ -24,6 +24,7 @@ MAX_HEADER = 1 << 16
 _FLOAT = np.dtype("<f8")
 _DTYPES: dict[str, np.dtype[Any]] = {"<f8": _FLOAT, "|u1": np.dtype("u1")}
 _FORMS_MAX = 64
+_FEW = 16  # numbers up to which looking at each in turn is fastest
 _NUMBER = rb"(0|[1-9][0-9]{0,17})"
 _VARIABLE = re.compile(
     rb'(\{[^{}]*?"seq":)' + _NUMBER + rb',"step":' + _NUMBER + rb',"lane":' + _NUMBER + rb',"lanes":([1-9][0-9]{0,8})'
@@ -131,12 +132,16 @@ class _Form:
     layout: _Layout
 
 
+_set = object.__setattr__
+
+
 def _variant(header: Any, seq: int, step: int, lane: int) -> Any:
     """A valid header with other numbers, which the caller has checked; model_copy takes ten times as long."""
     out = object.__new__(type(header))
-    object.__setattr__(out, "__dict__", {**header.__dict__, "seq": seq, "step": step, "lane": lane})
-    for slot in ("__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__"):
-        object.__setattr__(out, slot, getattr(header, slot))
+    _set(out, "__dict__", {**header.__dict__, "seq": seq, "step": step, "lane": lane})
+    _set(out, "__pydantic_fields_set__", header.__pydantic_fields_set__)
+    _set(out, "__pydantic_extra__", None)
+    _set(out, "__pydantic_private__", None)
     return out
 
 
@@ -197,8 +202,7 @@ class Decoder(Generic[M]):
         for slot in layout.slots:
             flat = np.frombuffer(payload, slot.dtype, slot.count, offset + slot.offset)
             if slot.dtype is _FLOAT:
-                few = slot.count < 8 and math.isfinite(sum(flat.tolist()))
-                if not few and not all_finite(flat):
+                if not all_finite(flat):
                     raise Rejected("finite", f"{slot.name} holds a value that is not finite")
             elif slot.count and (flat[0] if slot.count == 1 else flat.max()) > 1:
                 raise Rejected("mask", f"{slot.name} holds a value other than 0 and 1")
@@ -235,6 +239,8 @@ def all_finite(x: NDArray[np.float64]) -> bool:
     The product of the two halves is finite only if every factor is; if it is not, it may be an overflow: look closely.
     vdot, unlike dot, does not warn of that.
     """
+    if len(x) <= _FEW:
+        return all(map(math.isfinite, x.tolist()))
     half = len(x) // 2
     if len(x) > 1 and math.isfinite(np.vdot(x[:half], x[half : 2 * half])):
         return len(x) % 2 == 0 or math.isfinite(x[-1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import sys
@@ -10,6 +11,7 @@ import threading
 import traceback
 from collections.abc import Sequence
 
+import numpy as np
 from pydantic import ValidationError
 
 from testbed.errors import TestbedError
@@ -64,9 +66,11 @@ def _serve(bus: ZenohBus, run: str, name: str, build: Build) -> int:
     try:
         role = build(node, setup)
         bus.watch(node.keys.presence(ORCHESTRATOR), lambda _, alive: None if alive else orphaned.set())
+        settle_memory()
         node.announce()
-        while not node.stopped and not orphaned.is_set():
-            bus.run(_POLL_S)
+        with np.errstate(all="ignore"):  # what is not finite is looked for where it would leave a role
+            while not node.stopped and not orphaned.is_set():
+                bus.run(_POLL_S)
     except Exception as error:
         text = str(error) if isinstance(error, TestbedError) else f"{type(error).__name__}: {error}"
         traceback.print_exc()
@@ -76,6 +80,13 @@ def _serve(bus: ZenohBus, run: str, name: str, build: Build) -> int:
         return _refuse(f"{name}: the orchestrator is gone")
     node.report("stopped", role.counters)
     return 0
+
+
+def settle_memory() -> None:
+    """What is there now stays: keep the garbage collector from looking at it again and again while packets flow."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 50)
 
 
 def _refuse(text: str) -> int:
