@@ -8,7 +8,7 @@ import shlex
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +65,7 @@ class Run:
 
         Raises UsageError when the endpoint cannot be opened or an external role does not exist.
         """
-        from testbed.wire.session import open_router
+        from testbed.wire.session import closing, open_router
         from testbed.wire.zenoh_bus import ZenohBus
 
         names = [role.name for role in self._roles]
@@ -74,11 +74,15 @@ class Run:
                 raise UsageError(
                     f"--external {name}: no such role; allowed: {', '.join(names)}{did_you_mean(name, names)}"
                 )
-        transport = self._setup.scenario.transport
+        transport = self._setup.transport
         session, endpoint = open_router(transport)
         supervisor = Supervisor(self._out / "logs")
         recorder = self._recorder()
-        try:
+        with ExitStack() as cleanup:
+            cleanup.enter_context(closing(session))
+            if recorder is not None:
+                cleanup.callback(recorder.close)
+            cleanup.callback(supervisor.close, 0.0)
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.window == 1)
             conductor = self._conductor(bus, recorder)
             interrupted = False
@@ -96,11 +100,6 @@ class Run:
             self._settle(conductor, bus)
             supervisor.close(_LEAVE_S if conductor.collector.finished else 0.2)
             return self._finish(conductor, interrupted=interrupted)
-        finally:
-            supervisor.close(0.0)
-            if recorder is not None:
-                recorder.close()
-            session.close()  # type: ignore[no-untyped-call]
 
     @np.errstate(all="ignore")
     def in_process(self, schedule: int | None = None) -> Summary:
@@ -151,7 +150,7 @@ class Run:
         return Recorder(path, lanes=self._setup.tap, period_ns=scenario.clock.period_ns, metadata=metadata)
 
     def _by_hand(self, role: RoleSpec, endpoint: str) -> list[str]:
-        return command_of(role, endpoint, self._setup.run, self._setup.scenario.transport)
+        return command_of(role, endpoint, self._setup.run, self._setup.transport)
 
     def _drive(self, conductor: Conductor, bus: object, supervisor: Supervisor, *, patient: bool) -> None:
         """Until the run is over, has failed, or made no progress for the deadline."""

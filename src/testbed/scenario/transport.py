@@ -79,6 +79,11 @@ class Transport(Part):
     lanes_per_packet: Count | None = Field(
         default=None, description="The most lanes that one packet carries, 1 or more; left out: all of them."
     )
+    shared_memory: bool | None = Field(
+        default=None,
+        description="Whether large packets pass between processes of one host through shared memory; left out: where "
+        "they are large and the run listens on this host only.",
+    )
     tls: Tls | None = Field(default=None, description="Encryption; left out: none.")
     user: str | None = Field(default=None, min_length=1, description="User name of the processes.")
     password_env: str | None = Field(

@@ -19,7 +19,7 @@ from testbed.scenario import Transport
 from testbed.wire.bus import BusError
 from testbed.wire.keys import Keys
 from testbed.wire.node import ORCHESTRATOR, Node
-from testbed.wire.session import open_client
+from testbed.wire.session import closing, open_client
 from testbed.wire.setup import Build, Role, Setup
 from testbed.wire.zenoh_bus import ZenohBus
 
@@ -50,7 +50,7 @@ def serve(options: argparse.Namespace, name: str, build: Build) -> int:
         session = open_client(transport, options.connect)
     except TestbedError as error:
         return _refuse(str(error))
-    with session:
+    with closing(session):
         return _serve(ZenohBus(session, deadline_s=transport.deadline_ns / 1e9), options.run, name, build)
 
 

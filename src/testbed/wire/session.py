@@ -6,6 +6,9 @@ import json
 import os
 import re
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -16,6 +19,9 @@ from testbed.wire.bus import BusError
 
 LOOPBACK = "tcp/127.0.0.1:{port}"
 _PATIENCE_MS = 60_000
+_QUEUE_MAX = 16  # batches of 64 kB on their way out of a process
+_SHARED_MIN = 16_384  # bytes of a message from which shared memory pays
+_SEGMENT = re.compile(r"/dev/shm/\S+\.zenoh\b")
 
 
 def open_router(transport: Transport) -> tuple[zenoh.Session, str]:
@@ -61,7 +67,9 @@ def config(transport: Transport, mode: str, *, listen: str | None = None, connec
         "transport/unicast/open_timeout": 5_000,
         "transport/link/tx/lease": _PATIENCE_MS,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": _PATIENCE_MS * 1000,
-        "transport/shared_memory/enabled": False,
+        "transport/link/tx/queue/size/data": _QUEUE_MAX,
+        "transport/shared_memory/enabled": bool(transport.shared_memory),
+        "transport/shared_memory/transport_optimization/message_size_threshold": _SHARED_MIN,
     }
     if transport.tls is not None:
         values |= _tls(transport.tls, mode)
@@ -71,6 +79,26 @@ def config(transport: Transport, mode: str, *, listen: str | None = None, connec
         values["transport/auth/usrpwd/user"] = transport.user
         values["transport/auth/usrpwd/password"] = _password(transport)
     return values
+
+
+@contextmanager
+def closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
+    """Close a session at the end, and remove the names of the shared memory it used, which zenoh leaves for later."""
+    try:
+        yield session
+    finally:
+        segments = _segments()
+        session.close()  # type: ignore[no-untyped-call]
+        for segment in segments:
+            segment.unlink(missing_ok=True)
+
+
+def _segments() -> set[Path]:
+    """Shared memory of zenoh that this process has mapped."""
+    try:
+        return {Path(name) for name in _SEGMENT.findall(Path("/proc/self/maps").read_text())}
+    except OSError:
+        return set()
 
 
 def _open(transport: Transport, mode: str, *, listen: str | None = None, connect: str | None = None) -> zenoh.Session:

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
-from testbed.scenario import FeedbackInput, Scenario, parse_scenario, to_toml
+from testbed.scenario import FeedbackInput, Scenario, Transport, parse_scenario, to_toml
 from testbed.wire.codec import Sizes
 from testbed.wire.node import Node
 
 _WINDOW_MAX = 256
 _BYTES_IN_FLIGHT = 4_000_000
+_SHARED_MIN = 65_536  # bytes of the largest packet from which shared memory pays
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,16 @@ class Setup:
         n, p, q = self.sizes.n, self.sizes.p, self.sizes.q
         bytes_a_step = 8 * self.scenario.lanes * (2 * q + 2 * p + 2 * n + n * n)
         return max(4, min(_WINDOW_MAX, _BYTES_IN_FLIGHT // bytes_a_step))
+
+    @property
+    def transport(self) -> Transport:
+        """The scenario's transport, with what it leaves to the run decided."""
+        transport = self.scenario.transport
+        if transport.shared_memory is not None:
+            return transport
+        largest = 8 * self.blocks[0][1] * self.sizes.n * (1 + self.sizes.n)
+        local = transport.endpoint is None or "127.0.0.1" in transport.endpoint
+        return transport.model_copy(update={"shared_memory": local and largest >= _SHARED_MIN})
 
     @property
     def tap(self) -> int:
