@@ -142,16 +142,35 @@ def straight_line(
     functions: what ``Symbol.apply`` may call, by name.
     """
     program = traced(function, arguments, results)
-    body = "".join(f"    {name} = {expression}\n" for name, expression in program.lines)
+    values = [f"v{i}" for i in range(len(arguments))]
+    lines = [f"def compiled({', '.join(values)}):"]
+    names = iter(program.inputs)
+    for value, shape in zip(values, arguments, strict=True):
+        taken = [next(names) for _ in range(_size(shape))]
+        lines += [f"    {name} = {value}{place}" for name, place in zip(taken, _places(shape), strict=True)]
+    lines += [f"    {name} = {expression}" for name, expression in program.lines]
+    outputs = iter(program.outputs)
+    given = [_packed([next(outputs) for _ in range(_size(shape))], shape) for shape in results]
+    lines.append(f"    return {', '.join(given)},")
     namespace: dict[str, Any] = dict(functions)
-    returned = ", ".join(program.outputs)
-    exec(f"def compiled({', '.join(program.inputs)}):\n{body}    return ({returned},)\n", namespace)
-    compiled, flatten, unflatten = namespace["compiled"], program.flatten, program.unflatten
+    exec("\n".join(lines), namespace)
+    compiled: Callable[..., tuple[Any, ...]] = namespace["compiled"]
+    return compiled
 
-    def run(*values: Any) -> tuple[Any, ...]:
-        return unflatten(compiled(*flatten(values)))
 
-    return run
+def _places(shape: Shape) -> list[str]:
+    """Where the components of an argument are, in the order of ``_flat``."""
+    kind, n = shape
+    if kind in ("scalar", "mask"):
+        return [""]
+    if kind == "vector":
+        return [f"[{i}]" for i in range(n)]
+    return [f"[{i}][{j}]" for i in range(n) for j in range(i, n)]
+
+
+def _packed(flat: Sequence[str], shape: Shape) -> str:
+    """The expression of a result made of the given components."""
+    return str(_unflat(flat, shape)).replace("'", "")
 
 
 def _written(operand: object) -> str:
