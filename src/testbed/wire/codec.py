@@ -26,11 +26,11 @@ _DTYPES: dict[str, np.dtype[Any]] = {"<f8": _FLOAT, "|u1": np.dtype("u1")}
 _FORMS_MAX = 64
 _FEW = 16  # numbers up to which looking at each in turn is fastest
 _NUMBER = rb"(0|[1-9][0-9]{0,17})"
+_SEQ = b'"seq":'
 _VARIABLE = re.compile(
-    rb'(\{[^{}]*?"seq":)' + _NUMBER + rb',"step":' + _NUMBER + rb',"lane":' + _NUMBER + rb',"lanes":([1-9][0-9]{0,8})'
-    rb'(,"arrays":[^{}:]*\}) *'
+    _NUMBER + rb',"step":' + _NUMBER + rb',"lane":' + _NUMBER + rb',"lanes":([1-9][0-9]{0,8})(,"arrays":[^{}:]*\}) *'
 )
-"""A header as PacketEncoder writes it, cut into what is the same for every packet on a key and what is not.
+"""What follows ``"seq":`` in a header as PacketEncoder writes it; what comes before is the same for all on a key.
 
 No key follows ``arrays``: of a key that is there twice the last counts.
 """
@@ -165,11 +165,13 @@ class Decoder(Generic[M]):
         length = int.from_bytes(payload[4:8], "little")
         if length > MAX_HEADER or length % 8 or 8 + length > len(payload):
             raise Rejected("format", f"header of {length} bytes in a payload of {len(payload)}")
-        match = _VARIABLE.fullmatch(payload, 8, 8 + length)
-        form = self._forms.get(match.group(1, 5, 6)) if match is not None else None
+        numbers_at = payload.find(_SEQ, 8, 8 + length) + len(_SEQ)
+        match = _VARIABLE.fullmatch(payload, numbers_at, 8 + length) if numbers_at >= len(_SEQ) else None
+        key = (payload[8:numbers_at], *match.group(4, 5)) if match is not None else ()
+        form = self._forms.get(key)
         if match is not None and form is not None:
-            seq, step, lane = map(int, match.group(2, 3, 4))
-            variant = _variant(form.header, seq, step, lane)
+            seq, step, lane = match.group(1, 2, 3)
+            variant = _variant(form.header, int(seq), int(step), int(lane))
             self._check_range(variant)
             return variant, self._arrays(form.layout, payload, 8 + length)
         try:
@@ -187,7 +189,7 @@ class Decoder(Generic[M]):
         self._check_range(header)
         layout = self._layout(header.arrays, header.lanes)
         if match is not None and len(self._forms) < _FORMS_MAX:
-            self._forms[match.group(1, 5, 6)] = _Form(header, layout)
+            self._forms[key] = _Form(header, layout)
         return header, self._arrays(layout, payload, 8 + length)
 
     def _check_range(self, header: Packet) -> None:
