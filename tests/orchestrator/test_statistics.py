@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from testbed.analysis.consistency import chi_square_band
 from testbed.numerics.lanes import matrix_of, vector_of
-from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures, nees_band_95
+from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures
 
 
 def sample(lanes: int, n: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -57,7 +58,7 @@ def test_nees_is_not_defined_where_P_is_not_definite() -> None:
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 @pytest.mark.parametrize("lanes", [1, 2, 256, 100_000])
 def test_the_band_is_that_of_chi_square(n: int, lanes: int) -> None:
-    low, high = nees_band_95(n, lanes)
+    low, high = chi_square_band(n, lanes)
     law = stats.chi2(n * lanes)
     assert law.cdf(low * lanes) == pytest.approx(0.025, rel=1e-6)
     assert law.sf(high * lanes) == pytest.approx(0.025, rel=1e-6)

@@ -9,12 +9,12 @@ from importlib.metadata import version
 import numpy as np
 
 from testbed import __version__
+from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.channel.chains import chain_of
 from testbed.estimator.bounds import correlation_factor
 from testbed.estimator.service import acks_of, role_of
 from testbed.orchestrator.conductor import Conductor
-from testbed.orchestrator.statistics import nees_band_95
 from testbed.orchestrator.summary import (
     BoundFigures,
     Check,
@@ -198,7 +198,7 @@ def _estimators(conductor: Conductor) -> dict[str, EstimatorFigures]:
                 "kind": spec.kind,
                 "acks": acks_of(scenario, spec),
                 "until": spec.until,
-                "nees_band_95": nees_band_95(scenario.system.n, scenario.lanes),
+                "nees_band_95": chi_square_band(scenario.system.n, scenario.lanes),
                 "undefined": series.undefined,
                 "counters": report.counters,
                 **figures,

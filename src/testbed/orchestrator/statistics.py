@@ -7,7 +7,6 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from testbed.numerics.lanes import Cholesky, Component, Matrix, Vector, dot, many_lanes, one_lane, subtract, trace
 from testbed.numerics.moments import LaneMoments
@@ -37,12 +36,6 @@ def _compute(n: int, lanes: int) -> Callable[..., tuple[Component, ...]]:
     if lanes == 1:
         return one_lane(_figures, arguments, results)
     return many_lanes(_figures, arguments, results, lanes)
-
-
-def nees_band_95(n: int, lanes: int) -> tuple[float, float]:
-    """The 95 % band of the mean NEES over lanes: χ² with n·lanes degrees of freedom, divided by lanes."""
-    low, high = (2.0 * float(gammaincinv(0.5 * n * lanes, level)) / lanes for level in (0.025, 0.975))
-    return low, high
 
 
 class Series:
