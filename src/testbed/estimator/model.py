@@ -101,6 +101,10 @@ class Estimate:
     x: Vector
     p: Matrix
     lanes: int
+    error_bound: Floats | None = None
+    """Where the estimator certifies it: bound on the distance of x̂ to the exact one, in units of sqrt(tr P), (M,)."""
+    error_bound_P: Floats | None = None
+    """Bound on the relative error of tr P, (M,)."""
 
     @property
     def x_hat(self) -> Floats:

@@ -88,4 +88,7 @@ def replay(
         if not (np.isfinite(x_hat).all() and np.isfinite(P).all()):
             raise RunFailed(f"step {line.k}: the estimate left the range of floating-point numbers")
         out: dict[str, Any] = {"k": line.k, "x_hat": x_hat.tolist(), "P": P.tolist()}
+        if estimate.error_bound is not None and estimate.error_bound_P is not None:
+            out["error_bound"] = float(estimate.error_bound[0])
+            out["error_bound_P"] = float(estimate.error_bound_P[0])
         yield json.dumps(out)

@@ -25,6 +25,7 @@ _BUILT_IN = {
     "ff": "testbed.estimator.ff:Ff",
     "kfio": "testbed.estimator.kfio:Kfio",
     "oe": "testbed.estimator.oe:Oe",
+    "oe-lattice": "testbed.estimator.lattice:LatticeOe",
 }
 GROUP = "testbed.estimators"
 

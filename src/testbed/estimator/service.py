@@ -101,7 +101,10 @@ class EstimatorService:
         x_hat, P = estimate.x_hat, estimate.P
         if not (all_finite(x_hat.ravel()) and all_finite(P.ravel())):
             raise RunFailed(f"the estimate of '{self._name}' left the range of floating-point numbers at step {step}")
-        self._send(step, lane, block.lanes, {"x_hat": x_hat, "P": P})
+        arrays = {"x_hat": x_hat, "P": P}
+        if estimate.error_bound is not None and estimate.error_bound_P is not None:
+            arrays |= {"error_bound": estimate.error_bound, "error_bound_P": estimate.error_bound_P}
+        self._send(step, lane, block.lanes, arrays)
 
 
 def _acks(step: int, arrays: dict[str, NDArray[Any]] | None) -> tuple[Ack, ...]:

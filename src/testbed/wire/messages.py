@@ -120,6 +120,10 @@ class EstimateMessage(Packet):
     ARRAYS: ClassVar[dict[str, ArrayRule]] = {
         "x_hat": _floats("lanes", "n", text="estimate of x_k"),
         "P": _floats("lanes", "n", "n", text="its error covariance"),
+        "error_bound": _floats(
+            "lanes", required=False, text="certified distance of x_hat to the optimal one, in units of sqrt(tr P)"
+        ),
+        "error_bound_P": _floats("lanes", required=False, text="certified relative error of tr P"),
     }
 
 
