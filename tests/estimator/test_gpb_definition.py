@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -95,10 +96,9 @@ def test_the_error_decreases_with_the_order(chain: str) -> None:
     system = replace(random_system(rng, 2, 1, 1, chain), A=np.array([[0.9, 0.1], [-0.1, 0.8]]))
     system = replace(system, B=np.array([[-1.0], [1.0]]), C=np.array([[0.0, 1.0]]), Q=0.3 * np.eye(2), R=np.eye(1))
     trial = random_trial(rng, system, 9, 200)
-    trial = random_trial(rng, system, 9, 200) if np.abs(trial.u).max() < 3 else trial
     exact = run("oe", trial)[0][-1]
     errors = [np.linalg.norm(run("gpb", trial, {"order": d})[0][-1] - exact, axis=1).mean() for d in range(6)]
-    assert all(b < 0.9 * a for a, b in zip(errors, errors[1:], strict=False)), errors
+    assert all(b < 0.9 * a for a, b in pairwise(errors)), errors
 
 
 @check(30)
@@ -108,12 +108,11 @@ def test_all_acks_in_time_is_kfio(trial: Trial) -> None:
         assert_same(run("gpb", trial, {"order": order}), run("kfio", trial), 1e-9)
 
 
-@pytest.mark.parametrize(("order", "counts"), [(0, [0, 0, 1, 3]), (1, [0, 0, 0, 2]), (2, [0, 0, 0, 1]), (3, [0] * 4)])
+@pytest.mark.parametrize(("order", "counts"), [(0, [0, 0, 1, 3]), (1, [0, 0, 0, 1]), (2, [0, 0, 0, 1]), (3, [0] * 4)])
 def test_acks_of_merged_packets_are_counted(order: int, counts: list[int]) -> None:
     rng = np.random.default_rng(9)
     trial = random_trial(rng, random_system(rng, 2, 1, 1), 4, 1)
     trial.ack_step[:, 0] = [4, 3, 4, 0]
-    trial.ack_step[0, 0] = 4
     est = create("gpb", model_of(trial.system), lanes=1, options={"order": order})
     seen = []
     for k in range(1, trial.steps + 1):

@@ -1,4 +1,4 @@
-"""GPB by its definition: hypotheses in a table by their last control bits, joint Gaussians, moments of those that agree.
+"""GPB by its definition: hypotheses in a table by their last control bits, and the moments of those that agree.
 
 Each hypothesis has a tuple of the bits that are told apart; there are no logarithms of weights and no pairs here.
 """
