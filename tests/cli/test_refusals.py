@@ -103,7 +103,8 @@ def test_a_wrong_command_line(arguments: list[str], expected: str, testbed: Comm
         ({"estimators": []}, "the scenario has no [[estimators]]"),
         (
             {"estimators": [{"name": "kalman"}]},
-            "estimators.kalman: unknown estimator 'kalman'; allowed: aoe, ff, kfio, oe",
+            "estimators.kalman: unknown estimator 'kalman'; "
+            "allowed: aoe, ff, gpb, gpb1, gpb2, imm, kf, kfio, lmmse, oe, pf",
         ),
         ({"estimators": [{"name": "aoe", "depht": 1}]}, "estimators.aoe: estimator 'aoe': unknown option 'depht'"),
         (

@@ -11,13 +11,13 @@ from estimator.reference.cases import Trial, check, trials
 from estimator.reference.drive import acks_at, model_of, run, run_bounds
 from testbed.estimator.registry import create
 
-KINDS = ["kfio", "oe", "aoe", "ff"]
+KINDS = ["kfio", "kf", "oe", "aoe", "ff", "lmmse", "gpb", "gpb1", "gpb2", "imm"]
 SPLITS = [(1, 2, 4), (4, 3), (1,) * 7]
 
 
 def _trials(kind: str) -> st.SearchStrategy[Trial]:
-    chains = ("bernoulli",) if kind == "ff" else ("bernoulli", "markov")
-    acks = ("all",) if kind == "kfio" else ("none", "subset", "late")
+    chains = ("bernoulli",) if kind in ("ff", "lmmse") else ("bernoulli", "markov")
+    acks = ("all",) if kind in ("kfio", "kf") else ("none", "subset", "late")
     return trials(acks=acks, chains=chains, steps=(3, 6), lanes=(7, 7))
 
 

@@ -43,7 +43,7 @@ def steps(kind: str, lanes: int) -> list[np.ndarray]:
     return out
 
 
-@pytest.mark.parametrize("kind", ["aoe", "ff", "kfio"])
+@pytest.mark.parametrize("kind", ["aoe", "ff", "gpb", "imm", "kfio", "lmmse"])
 def test_estimators_have_the_same_bits_compiled_and_not(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     lanes = LANES_MIN + 3
     assert available()
@@ -57,11 +57,14 @@ def test_estimators_have_the_same_bits_compiled_and_not(kind: str, monkeypatch: 
 def uncached(kind: str, lanes: int) -> list[np.ndarray]:
     """The same steps, with the step functions made anew."""
     module = sys.modules[f"testbed.estimator.{kind}"]
-    module._stepper.cache_clear()
+    caches = [getattr(module, name) for name in ("_stepper", "_merger") if hasattr(module, name)]
+    for cache in caches:
+        cache.cache_clear()
     try:
         return steps(kind, lanes)
     finally:
-        module._stepper.cache_clear()
+        for cache in caches:
+            cache.cache_clear()
 
 
 def test_bounds_have_the_bits_of_single_lanes() -> None:

@@ -32,7 +32,7 @@ def replay(
     loaded = load_scenario(scenario)
     spec = next((s for s in loaded.estimators if s.name == estimator), None) or EstimatorSpec(name=estimator)
     model = model_of(loaded)
-    made = create(spec.kind, model, lanes=1, options=spec.options)
+    made = create(spec.kind, model, lanes=1, options=spec.options, lane=lane)
     lines = _lines(packets, lane, perfect=spec.acks == "perfect")
     written = []
     try:

@@ -38,6 +38,8 @@ class Kfio:
     ν need not be acknowledged where the control link never loses or where B u = 0.
     """
 
+    kind = "kfio"
+
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
         self._advance = _stepper(model, lanes)
@@ -51,7 +53,7 @@ class Kfio:
         complete = acks == "perfect" or (acks == "link" and isinstance(link.loss, NoLoss))
         if not complete and not self._model.control.never_loses and self._model.q and not _zero(scenario.input):
             raise UsageError(
-                f"kfio needs every ACK and gets {'none' if acks == 'none' else 'them over a lossy link'}; "
+                f"{self.kind} needs every ACK and gets {'none' if acks == 'none' else 'them over a lossy link'}; "
                 'allowed: acks = "perfect" here, [links.ack] mode = "perfect", or another estimator (aoe, ff, oe)'
             )
 
@@ -74,7 +76,7 @@ class Kfio:
         idle = np.all([np.asarray(b) == 0.0 for b in push], axis=0) if push else np.True_
         if not np.all(known | idle):
             raise MissingAck(
-                f"kfio needs the ACK of control packet {self._k - 1} at step {self._k} and none has come; "
+                f"{self.kind} needs the ACK of control packet {self._k - 1} at step {self._k} and none has come; "
                 'give it acks = "perfect", or use aoe, ff or oe'
             )
         return nu

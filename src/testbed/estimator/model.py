@@ -116,7 +116,11 @@ class Estimate:
 
 
 class Estimator(Protocol):
-    """One step = the move from k − 1 to k, then the observation of k."""
+    """One step = the move from k − 1 to k, then the observation of k.
+
+    It may also have ``check_scenario`` (see registry.check), ``begin_at`` (see registry.create), and ``takes_every_y``
+    (see packets.replay).
+    """
 
     counters: dict[str, int]
 

@@ -71,12 +71,14 @@ def replay(
 ) -> Iterator[str]:
     """Lines of OUT.jsonl: k, x_hat, P, up to step ``until``.
 
+    An estimator with ``takes_every_y`` gets a y that carried only noise as one that arrived; the others do not see it.
     Raises what the estimator raises, and RunFailed for what is not finite.
     """
+    every_y = getattr(estimator, "takes_every_y", False)
     for line in packets:
         if until is not None and line.k > until:
             return
-        arrived = line.y is not None and line.gamma != 0
+        arrived = line.y is not None and (every_y or line.gamma != 0)
         y = line.y if arrived and line.y is not None else [0.0] * model.p
         acks = tuple(Ack(j, np.array([nu]), np.array([1])) for j, nu in line.acks or ()) if use_acks else ()
         try:

@@ -23,9 +23,16 @@ from testbed.scenario import EstimatorSpec, Scenario
 _BUILT_IN = {
     "aoe": "testbed.estimator.aoe:Aoe",
     "ff": "testbed.estimator.ff:Ff",
+    "gpb": "testbed.estimator.gpb:Gpb",
+    "gpb1": "testbed.estimator.gpb1:Gpb1",
+    "gpb2": "testbed.estimator.gpb2:Gpb2",
+    "imm": "testbed.estimator.imm:Imm",
+    "kf": "testbed.estimator.kf:Kf",
     "kfio": "testbed.estimator.kfio:Kfio",
+    "lmmse": "testbed.estimator.lmmse:Lmmse",
     "oe": "testbed.estimator.oe:Oe",
     "oe-lattice": "testbed.estimator.lattice:LatticeOe",
+    "pf": "testbed.estimator.pf:Pf",
 }
 GROUP = "testbed.estimators"
 
@@ -35,13 +42,21 @@ def kinds() -> list[str]:
     return sorted({*_BUILT_IN, *(point.name for point in entry_points(group=GROUP))})
 
 
-def create(kind: str, model: Model, *, lanes: int, options: Mapping[str, Any] | None = None) -> Estimator:
-    """An estimator for ``lanes`` lanes.
+def create(
+    kind: str, model: Model, *, lanes: int, options: Mapping[str, Any] | None = None, lane: int = 0
+) -> Estimator:
+    """An estimator for the lanes lane … lane + lanes − 1 of a run.
+
+    One that draws random numbers has ``begin_at(lane)``, so that its draws do not depend on how lanes are split.
 
     Raises UsageError for an unknown kind or option, or where the estimator does not hold for the model.
     """
     factory = _factory(kind)
-    return factory(model, lanes, **_checked(kind, factory, dict(options or {})))
+    made = factory(model, lanes, **_checked(kind, factory, dict(options or {})))
+    begin_at = getattr(made, "begin_at", None)
+    if begin_at is not None:
+        begin_at(lane)
+    return made
 
 
 def check(spec: EstimatorSpec, model: Model, *, acks: str, scenario: Scenario) -> None:

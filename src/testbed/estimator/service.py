@@ -64,7 +64,11 @@ class EstimatorService:
         self._until = spec.until or scenario.steps
         self._send = node.sender(node.keys.estimate(name), EstimateMessage)
         self._blocks = {
-            lane: _Block(create(spec.kind, model, lanes=lanes, options=spec.options), lanes, 2 if acks == "none" else 3)
+            lane: _Block(
+                create(spec.kind, model, lanes=lanes, options=spec.options, lane=lane),
+                lanes,
+                2 if acks == "none" else 3,
+            )
             for lane, lanes in setup.blocks
         }
         keys = node.keys

@@ -2,7 +2,8 @@
 
 numpy does one operation on all lanes after the other; a loop does all operations on one lane, and needs memory only at
 its ends. Only additions, multiplications, divisions, square roots and choices are compiled, without contraction, so
-that nothing is rounded otherwise than by numpy. ``exp`` stays numpy's own: a function is cut into loops around it.
+that nothing is rounded otherwise than by numpy. ``exp`` and ``log`` stay numpy's own: a function is cut into loops
+around them.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ LANES_MIN = 1024
 SWITCH = "TESTBED_KERNELS"
 """Environment variable; ``off`` keeps to numpy."""
 
-_BETWEEN = "exp"
+_BETWEEN = ("exp", "log")
 
 
 def available() -> bool:
@@ -78,7 +79,7 @@ def _stages(program: Program) -> list[_Stage]:
     born: dict[str, int] = dict.fromkeys(program.inputs, -1)
     for name, expression in program.lines:
         call, _, operand = expression.partition("(")
-        if call == _BETWEEN:
+        if call in _BETWEEN:
             stages[-1].after = (name, call, operand.rstrip(")"))
             _need(stages, born, [operand.rstrip(")")], len(stages))
             stages.append(_Stage())

@@ -22,6 +22,7 @@ from testbed.numerics.kernels import LANES_MIN, available, kernel
 from testbed.numerics.symbols import Shape, Symbol, straight_line
 
 _STRAIGHT_MAX = 8  # order of the largest matrix for which code is written out
+_LARGEST = float(np.finfo(np.float64).max)
 
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -223,7 +224,19 @@ def exp(x: Component) -> Component:
     return x.apply("exp") if isinstance(x, Symbol) else np.exp(x)
 
 
-def clip(x: Component, low: float, high: float) -> Component:
+def log(x: Component) -> Component:
+    """log by numpy in both forms, as ``exp``."""
+    if isinstance(x, float):
+        return float(np.log(x))
+    return x.apply("log") if isinstance(x, Symbol) else np.log(x)
+
+
+def larger(a: Component, b: Component) -> Component:
+    """The larger of two finite components."""
+    return clip(a, b, _LARGEST)
+
+
+def clip(x: Component, low: Component, high: Component) -> Component:
     if isinstance(x, float):
         return min(max(x, low), high)
     if isinstance(x, Symbol):
@@ -237,7 +250,13 @@ def one_lane(
     """``function`` as straight-line code for one lane, to the same bits; itself where it is too long for that."""
     if max(n for _, n in arguments) > _STRAIGHT_MAX:
         return cast(Callable[..., tuple[Any, ...]], function)
-    calls: dict[str, Callable[..., Any]] = {"sqrt": sqrt, "reciprocal": reciprocal, "exp": exp, "clip": clip}
+    calls: dict[str, Callable[..., Any]] = {
+        "sqrt": sqrt,
+        "reciprocal": reciprocal,
+        "exp": exp,
+        "log": log,
+        "clip": clip,
+    }
     return straight_line(function, arguments, results, calls)
 
 
@@ -247,7 +266,7 @@ def many_lanes(
     """``function`` for many lanes: compiled where that is possible and pays, to the same bits; else itself."""
     if lanes < LANES_MIN or max(n for _, n in arguments) > _STRAIGHT_MAX or not available():
         return cast(Callable[..., tuple[Any, ...]], function)
-    return kernel(function, arguments, results, {"exp": exp})
+    return kernel(function, arguments, results, {"exp": exp, "log": log})
 
 
 class Cholesky:
@@ -304,3 +323,10 @@ class Cholesky:
         """b' S^{-1} b."""
         half = self.half_solve(b)
         return dot(half, half)
+
+    def log_density(self, b: Vector) -> Component:
+        """log N(b; 0, S) but for −½ log 2π a dimension."""
+        peak = self._inverse_diagonal[0]
+        for factor in self._inverse_diagonal[1:]:
+            peak = peak * factor
+        return log(peak) - 0.5 * self.quadratic(b)

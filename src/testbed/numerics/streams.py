@@ -36,8 +36,7 @@ class Stream:
     """
 
     def __init__(self, seed: int, component: str, purpose: str, *, width: int, lane: int, lanes: int) -> None:
-        digest = hashlib.blake2b(f"{seed}|{component}|{purpose}".encode(), digest_size=16).digest()
-        self._key = np.frombuffer(digest, dtype="<u8").astype(np.uint64)
+        self._key = _key(seed, component, purpose)
         self._width, self._lane, self._lanes = width, lane, lanes
         self._tiles: dict[str, _Tile] = {}
 
@@ -69,18 +68,56 @@ class Stream:
         return np.ascontiguousarray(raw.reshape(self._lanes, TILE, words).transpose(1, 2, 0))
 
     def _uniform(self, raw: NDArray[np.uint64]) -> Floats:
-        return raw.astype(np.float64) * 2.0**-53
+        return _uniform(raw)
 
     def _normal(self, raw: NDArray[np.uint64]) -> Floats:
-        pairs = raw.shape[1] // 2
-        radius = (raw[:, :pairs] + np.uint64(1)).astype(np.float64)
-        radius *= 2.0**-53
-        np.log(radius, out=radius)
-        radius *= -2.0
-        np.sqrt(radius, out=radius)
-        angle = raw[:, pairs:].astype(np.float64)
-        angle *= 2.0 * np.pi * 2.0**-53
-        normals = np.concatenate([np.cos(angle), np.sin(angle, out=angle)], axis=1)
-        normals[:, :pairs] *= radius
-        normals[:, pairs:] *= radius
-        return normals[:, : self._width]
+        return _normal(raw)[:, : self._width]
+
+
+class LaneStream:
+    """Many draws of one lane and step at once; nothing is kept between calls.
+
+    As with ``Stream``, uniform and normal draws of one purpose are not independent.
+    """
+
+    def __init__(self, seed: int, component: str, purpose: str) -> None:
+        self._key = _key(seed, component, purpose)
+
+    def uniforms(self, lane: int, step: int, count: int) -> Floats:
+        """(count,), uniform on [0, 1)."""
+        return _uniform(self._raw(lane, step, count))
+
+    def normals(self, lane: int, step: int, count: int) -> Floats:
+        """(count,), standard normal."""
+        return _normal(self._raw(lane, step, count + count % 2)[None, :, None])[0, :count, 0]
+
+    def _raw(self, lane: int, step: int, words: int) -> NDArray[np.uint64]:
+        counter = np.array([0, lane, step, 1], dtype=np.uint64)
+        raw: NDArray[np.uint64] = np.random.Philox(key=self._key, counter=counter).random_raw(words)
+        raw >>= np.uint64(11)
+        return raw
+
+
+def _key(seed: int, component: str, purpose: str) -> NDArray[np.uint64]:
+    digest = hashlib.blake2b(f"{seed}|{component}|{purpose}".encode(), digest_size=16).digest()
+    return np.frombuffer(digest, dtype="<u8").astype(np.uint64)
+
+
+def _uniform(raw: NDArray[np.uint64]) -> Floats:
+    return raw.astype(np.float64) * 2.0**-53
+
+
+def _normal(raw: NDArray[np.uint64]) -> Floats:
+    """Words (steps, words, lanes), an even number of them, as normals of the same shape."""
+    pairs = raw.shape[1] // 2
+    radius = (raw[:, :pairs] + np.uint64(1)).astype(np.float64)
+    radius *= 2.0**-53
+    np.log(radius, out=radius)
+    radius *= -2.0
+    np.sqrt(radius, out=radius)
+    angle = raw[:, pairs:].astype(np.float64)
+    angle *= 2.0 * np.pi * 2.0**-53
+    normals = np.concatenate([np.cos(angle), np.sin(angle, out=angle)], axis=1)
+    normals[:, :pairs] *= radius
+    normals[:, pairs:] *= radius
+    return normals

@@ -1,0 +1,153 @@
+"""PF: a bootstrap particle filter, to check the others on small systems (theory.md 3.8)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import Ge, Le
+from numpy.typing import NDArray
+
+from testbed.estimator.mixtures import IMPOSSIBLE
+from testbed.estimator.model import Ack, Estimate, Model
+from testbed.numerics.lanes import (
+    Cholesky,
+    Constant,
+    Floats,
+    Vector,
+    add,
+    constant,
+    constant_times,
+    matrix_of,
+    subtract,
+    vector_of,
+)
+from testbed.numerics.streams import LaneStream
+
+
+@dataclass
+class _Cloud:
+    """Particles of one lane: x, n arrays (N,); nu (N,), the last control bits; scores (N,), logarithms of weights."""
+
+    x: Vector
+    nu: NDArray[np.bool_] | None
+    scores: Floats
+
+
+class Pf:
+    """``particles`` samples of x and of the last ν in each lane, drawn from the model and weighed by the likelihood.
+
+    Systematic resampling once the effective number of particles is below half of them. What is drawn depends on
+    ``seed``, the number of the lane and the step alone.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        lanes: int,
+        particles: Annotated[int, Ge(2), Le(1_000_000)] = 1000,
+        seed: Annotated[int, Ge(0)] = 0,
+    ) -> None:
+        self._model, self._lanes, self._particles = model, lanes, particles
+        self._normals = LaneStream(seed, "estimator.pf", "noise")
+        self._uniforms = LaneStream(seed, "estimator.pf", "control")
+        self._root = _root(model.Q)
+        self._factor = Cholesky([list(row) for row in model.sensor_noise])
+        self._first = 0
+        self._clouds: list[_Cloud] | None = None
+        self._k = 0
+        self.counters: dict[str, int] = {}
+
+    def begin_at(self, lane: int) -> None:
+        """``lane``: the number that the first lane has in the run."""
+        self._first = lane
+
+    def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
+        """An ACK of ν_{k−1} is used; older ones come too late and are counted."""
+        if self._clouds is None:
+            self._clouds = [self._start(self._first + lane) for lane in range(self._lanes)]
+        self._k += 1
+        fates = self._fates(acks)
+        n = self._model.n
+        x_hat, P = np.empty((self._lanes, n)), np.empty((self._lanes, n, n))
+        for lane, cloud in enumerate(self._clouds):
+            normals, uniforms = self._draws(self._first + lane)
+            self._move(cloud, u[lane], fates[lane], normals, uniforms)
+            if arrived[lane]:
+                self._weigh(cloud, y[lane])
+            weights = np.exp(cloud.scores - cloud.scores.max())
+            weights /= weights.sum()
+            x_hat[lane], P[lane] = _moments(cloud.x, weights)
+            if self._particles * (weights * weights).sum() > 2.0:
+                _resample(cloud, weights, float(uniforms[-1]))
+        return Estimate(vector_of(x_hat), matrix_of(P), self._lanes)
+
+    def _start(self, lane: int) -> _Cloud:
+        normals = self._normals.normals(lane, 0, self._model.n * self._particles)
+        spread = constant_times(_root(self._model.P0), list(normals.reshape(self._model.n, self._particles)))
+        x = [np.full(self._particles, m) + s for m, s in zip(self._model.x0_mean, spread, strict=True)]
+        return _Cloud(x, None, np.zeros(self._particles))
+
+    def _draws(self, lane: int) -> tuple[Vector, Floats]:
+        n, particles = self._model.n, self._particles
+        normals = self._normals.normals(lane, self._k, n * particles).reshape(n, particles)
+        return list(normals), self._uniforms.uniforms(lane, self._k, particles + 1)
+
+    def _fates(self, acks: tuple[Ack, ...]) -> list[bool | None]:
+        """ν_{k−1} of each lane, None where it is not known."""
+        fates: list[bool | None] = [None] * self._lanes
+        for ack in acks:
+            if ack.j == self._k - 1:
+                for lane in np.flatnonzero(ack.known):
+                    fates[lane] = bool(ack.nu[lane])
+            else:
+                self.counters["late_acks"] = self.counters.get("late_acks", 0) + int(np.count_nonzero(ack.known))
+        return fates
+
+    def _move(self, cloud: _Cloud, u: Floats, fate: bool | None, normals: Vector, uniforms: Floats) -> None:
+        """Draw ν_{k−1} and x_k from the model; where ν is known, take it and weigh by its probability."""
+        model = self._model
+        arrival = np.broadcast_to(model.control.arrival_given(cloud.nu), self._particles)
+        if fate is None:
+            cloud.nu = uniforms[:-1] < arrival
+        else:
+            with np.errstate(divide="ignore"):
+                chance = np.log(arrival if fate else 1.0 - arrival)
+            cloud.scores = cloud.scores + np.maximum(chance, IMPOSSIBLE)
+            cloud.nu = np.full(self._particles, fate)
+        x = add(constant_times(model.a, cloud.x), constant_times(self._root, normals))
+        push = model.control_effect([float(v) for v in u]) if model.q else [0.0] * model.n
+        cloud.x = [m + np.where(cloud.nu, b, 0.0) for m, b in zip(x, push, strict=True)]
+
+    def _weigh(self, cloud: _Cloud, y: Floats) -> None:
+        innovation = subtract([float(v) for v in y], constant_times(self._model.c, cloud.x))
+        scores = cloud.scores - 0.5 * self._factor.quadratic(innovation)
+        cloud.scores = scores - scores.max()
+
+
+def _moments(x: Vector, weights: Floats) -> tuple[Floats, Floats]:
+    n = len(x)
+    mean = np.array([(weights * component).sum() for component in x])
+    away = [component - m for component, m in zip(x, mean, strict=True)]
+    covariance = np.empty((n, n))
+    for i in range(n):
+        for j in range(i, n):
+            covariance[i, j] = covariance[j, i] = (weights * away[i] * away[j]).sum()
+    return mean, covariance
+
+
+def _resample(cloud: _Cloud, weights: Floats, uniform: float) -> None:
+    """Systematic: one uniform number for all, each particle kept ⌊N w⌋ or ⌈N w⌉ times."""
+    count = len(weights)
+    chosen = np.searchsorted(np.cumsum(weights), (uniform + np.arange(count)) / count, side="right")
+    chosen = np.minimum(chosen, count - 1)
+    cloud.x = [component[chosen] for component in cloud.x]
+    cloud.nu = None if cloud.nu is None else cloud.nu[chosen]
+    cloud.scores = np.zeros(count)
+
+
+def _root(matrix: Floats) -> Constant:
+    """F with F F' = matrix, also where that is singular."""
+    values, vectors = np.linalg.eigh(matrix)
+    return constant(vectors * np.sqrt(np.maximum(values, 0.0)))
