@@ -24,7 +24,7 @@ def scenario(**changes: Any) -> Scenario:
 
 
 MODEL = model_of(scenario())
-BUILT_IN = ["aoe", "ff", "gpb", "gpb1", "gpb2", "imm", "kf", "kfio", "lmmse", "oe", "pf"]
+BUILT_IN = ["aoe", "ff", "gpb", "gpb1", "gpb2", "imm", "kf", "kfio", "lmmse", "oe", "oe-lattice", "pf"]
 ALLOWED = ", ".join(sorted([*BUILT_IN, "function", "silly"]))
 
 
