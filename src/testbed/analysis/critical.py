@@ -52,27 +52,36 @@ def critical_arrival(A: Floats, C: Floats) -> CriticalArrival:
     lower = recovery_threshold(A)
     if not unstable_eigenvalues(A):
         return CriticalArrival(0.0, 0.0, 0.0, "no eigenvalue outside the unit circle")
-    if any(abs(value) > 1.0 + MARGINAL for value in observability(A, C).failing):
-        return CriticalArrival(lower, None, None, "an unstable eigenvalue is not observed: no arrival rate suffices")
+    if not observability(A, C).stable_rest:
+        return CriticalArrival(
+            lower, None, None, "an eigenvalue that does not decay is not observed: no arrival rate suffices"
+        )
     upper = riccati_bound(A, C)
     if observed_at_once(A, C):
         return CriticalArrival(lower, lower, lower, "C has full column rank on the unstable subspace")
+    if upper is not None and upper <= lower + _SETTLED:
+        return CriticalArrival(lower, lower, lower, "one unstable eigenvalue: the bounds meet")
     if strong_observability(A, C).holds:
         return CriticalArrival(lower, upper, lower, "strongly observable (M Theorem 5)")
     return CriticalArrival(lower, upper, None, "between 1 − ρ^{-2} and the bound of the modified Riccati equation")
 
 
 def unstable_part(A: Floats, C: Floats) -> tuple[_Complex, _Complex]:
-    """(A_u, C_u), shapes (m, m) and (p, m): A and C on the invariant subspace of the m unstable eigenvalues."""
-    made: Any = schur(A.astype(np.complex128), output="complex", sort=lambda value: abs(value) > 1.0 + MARGINAL)
-    triangle, basis, m = made
+    """(A_u, C_u), shapes (m, m) and (p, m): A and C on the invariant subspace of the m eigenvalues with modulus
+    1 or more, to ``MARGINAL``."""
+    sorted_schur: Any = schur  # its stubs give the sort two arguments; here it gets one, complex
+    triangle, basis, m = sorted_schur(A.astype(np.complex128), output="complex", sort=_lasting)
     return triangle[:m, :m], C @ basis[:, :m]
+
+
+def _lasting(value: complex) -> bool:
+    return abs(value) >= 1.0 - MARGINAL
 
 
 def observed_at_once(A: Floats, C: Floats) -> bool:
     """Whether one observation determines the unstable part: C has full column rank on the unstable subspace."""
     Au, Cu = unstable_part(A, C)
-    return _rank(Cu) == Au.shape[0]
+    return bool(_rank(Cu) == Au.shape[0])
 
 
 def riccati_bound(A: Floats, C: Floats) -> float | None:
@@ -85,7 +94,7 @@ def riccati_bound(A: Floats, C: Floats) -> float | None:
     m = Au.shape[0]
     if m == 0:
         return 0.0
-    if any(abs(value) > 1.0 + MARGINAL for value in observability(A, C).failing):
+    if not observability(A, C).stable_rest:
         return None
     rank = _rank(Cu)
     moduli = np.abs(np.diag(Au))

@@ -74,7 +74,7 @@ def _first_contraction(A: Floats, s: float) -> tuple[int | None, float]:
 
 
 def condition_two(d: tuple[float, ...], index: int, series: float, recovery: float, failure: float) -> float:
-    """The left side of P Theorem 6 (ii): p q d_1 [1 + Σ_{i=1}^{I0−1} d_i (1−p)^i] Σ_j ‖A^j‖² (1−q)^{j−1}; < 1 wanted."""
+    """Left side of P Theorem 6 (ii): p q d_1 [1 + Σ_{i=1}^{I0−1} d_i (1−p)^i] Σ_j ‖A^j‖² (1−q)^{j−1}; < 1 is wanted."""
     inner = 1.0 + sum(d[i - 1] * (1.0 - failure) ** i for i in range(1, index))
     return failure * recovery * d[0] * inner * series
 
@@ -87,15 +87,15 @@ def failure_limit(d: tuple[float, ...], index: int, series: float, recovery: flo
     factor = recovery * d[0] * series
     if factor == 0.0:
         return 1.0
-    p = np.polynomial.Polynomial([0.0, 1.0])
     inner = np.polynomial.Polynomial([1.0])
     for i in range(1, index):
-        inner = inner + d[i - 1] * (1.0 - p) ** i
-    roots = (factor * p * inner - 1.0).roots()
-    inside = [float(root.real) for root in roots if abs(root.imag) < 1e-9 and 0.0 < root.real <= 1.0]
+        inner = inner + d[i - 1] * np.polynomial.Polynomial([1.0, -1.0]) ** i
+    left = np.polynomial.Polynomial([0.0, factor]) * inner
+    roots = [complex(root) for root in (left - 1.0).roots()]
+    inside = [root.real for root in roots if abs(root.imag) < 1e-9 and 0.0 < root.real <= 1.0]
     return min(inside, default=1.0)
 
 
 def scalar_peak_is_stable(a: float, recovery: float, order: float = 1.0) -> bool:
     """P Theorem 8 (order 1) and Corollary 9: |a|^{2r} (1−q) < 1, necessary and sufficient for c ≠ 0, Q > 0."""
-    return abs(a) ** (2.0 * order) * (1.0 - recovery) < 1.0
+    return bool(abs(a) ** (2.0 * order) * (1.0 - recovery) < 1.0)

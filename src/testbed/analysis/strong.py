@@ -31,7 +31,7 @@ def strong_observability(A: Floats, C: Floats) -> StrongObservability:
     """
     size = float(np.linalg.norm(A, 2)) or 1.0
     spaces: list[tuple[complex, int, Floats]] = []
-    for cluster in _clusters(np.linalg.eigvals(A), EQUAL * size):
+    for cluster in _clusters([complex(value) for value in np.linalg.eigvals(A)], EQUAL * size):
         centre, multiplicity = complex(np.mean(cluster)), len(cluster)
         _, sizes, right = np.linalg.svd((A - centre * np.eye(A.shape[0])) / size)
         found = int((sizes <= EQUAL).sum())
@@ -59,10 +59,10 @@ def shown(value: complex) -> str:
     return f"{value.real:.6g}{value.imag:+.6g}i"
 
 
-def _clusters(values: Floats, width: float) -> list[list[complex]]:
+def _clusters(values: list[complex], width: float) -> list[list[complex]]:
     """The values in groups; each is within ``width`` of another of its group."""
     groups: list[list[complex]] = []
-    for value in (complex(v) for v in values):
+    for value in values:
         near = [group for group in groups if any(abs(value - other) <= width for other in group)]
         groups = [group for group in groups if group not in near]
         groups.append([value, *(other for group in near for other in group)])

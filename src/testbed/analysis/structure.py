@@ -34,7 +34,7 @@ class Reach:
     @property
     def stable_rest(self) -> bool:
         """Whether everything left out decays: detectable, or stabilisable."""
-        return all(abs(value) < 1.0 for value in self.failing)
+        return all(abs(value) < 1.0 - MARGINAL for value in self.failing)
 
 
 def observability(A: Floats, C: Floats) -> Reach:

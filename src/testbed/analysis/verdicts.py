@@ -75,6 +75,11 @@ class Facts:
         """Whether the noise reaches every eigenvalue outside the open unit disc."""
         return self.controllable.stable_rest
 
+    def strongly(self, chain: Chain) -> bool:
+        """Whether M Theorem 5 applies: M Assumptions 1 (controllable, observable, the chain irreducible) and 2."""
+        structure = self.controllable.full and self.observable.full and self.strong.holds
+        return structure and chain.recovery > 0.0 and chain.failure > 0.0
+
     @property
     def scalar(self) -> bool:
         """Whether P Theorem 8 applies: n = p = 1, c ≠ 0, Q > 0."""
@@ -137,10 +142,10 @@ def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
         if not facts.noise_feeds_growth:
             return Verdict(None, "none", f"{listed}, and the noise does not reach all that grows")
         return Verdict(False, "detectability", f"{listed}: no link helps")
-    if chain.never_loses or (chain.failure == 0.0 and chain.recovery > 0.0):
+    if chain.never_loses:
         if facts.noise_feeds_growth:
-            return Verdict(True, "Kalman filter", "(A, C) is detectable and losses do not go on")
-        return Verdict(None, "none", "no losses that go on, but the noise does not reach all that grows")
+            return Verdict(True, "Kalman filter", "(A, C) is detectable and nothing is lost")
+        return Verdict(None, "none", "no losses, but the noise does not reach all that grows")
     if not facts.noise_feeds_growth:
         return Verdict(None, "none", "(A, sqrt Q) is not stabilisable: no theorem here applies")
     threshold = recovery_threshold(facts.A)
@@ -150,12 +155,11 @@ def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
     if _equal(chain.recovery, threshold):
         return Verdict(None, "none", f"{growth}: at the threshold {threshold:.6g}, which no theorem decides")
     if chain.recovery < threshold:
-        theorem = "P Theorem 8" if facts.scalar else "M Theorem 5" if facts.strong.holds else "Sinopoli lower bound"
-        if theorem.startswith("Sinopoli") and not chain.independent:
-            theorem = "1 − ρ^{-2}"
+        general = "Sinopoli lower bound" if chain.independent else "bound 1 − ρ^{-2}"
+        theorem = "M Theorem 5" if facts.strongly(chain) else general
         return Verdict(False, theorem, f"{growth} > 1: a burst of losses outgrows its probability")
     below = f"{growth} < 1"
-    if facts.strong.holds and facts.observable.full and facts.controllable.full and _irreducible(chain):
+    if facts.strongly(chain):
         return Verdict(True, "M Theorem 5", f"{below}, strongly observable, (A, sqrt Q) controllable")
     if observed_at_once(facts.A, facts.C):
         return Verdict(True, "P Lemma 5", f"{below}, one observation determines the unstable part")
@@ -220,9 +224,7 @@ def _peak_verdict(facts: Facts, chain: Chain, first: bool, second: bool | None) 
         return Verdict(True, name, f"{growth} < 1, and condition (ii) holds")
     if not first:
         return Verdict(None, "P Theorem 6", f"{growth}: condition (i) fails; it is sufficient only")
-    return Verdict(
-        None, "P Theorem 6", "condition (ii) does not hold, or its series is too slow; it is sufficient only"
-    )
+    return Verdict(None, "P Theorem 6", "condition (ii) is not known to hold; it is sufficient only")
 
 
 def moment_figures(facts: Facts, chain: Chain, observation: Verdict) -> dict[str, Any]:
@@ -239,6 +241,8 @@ def moment_figures(facts: Facts, chain: Chain, observation: Verdict) -> dict[str
     def finite(r: float) -> bool | None:
         if bounded:
             return True
+        if observation.stable is False:
+            return False
         if order <= r and facts.noise_feeds_growth:
             return False
         return True if sufficient and order > r and facts.radius > 1.0 and chain.recovery > 0.0 else None
@@ -291,13 +295,9 @@ def vanishing_input(source: Input | None) -> tuple[bool | None, str]:
 
 def _marginal(facts: Facts, chain: Chain) -> Verdict:
     """ρ(A) = 1: nothing grows exponentially."""
-    if facts.strong.holds and facts.observable.full and facts.controllable.full and _irreducible(chain):
+    if facts.strongly(chain):
         return Verdict(True, "M Theorem 5", "ρ(A) = 1, recovery > 0, strongly observable")
     return Verdict(None, "none", f"ρ(A) = 1, and the premises of M Theorem 5 do not hold: {facts.strong.reason}")
-
-
-def _irreducible(chain: Chain) -> bool:
-    return chain.recovery > 0.0 and chain.failure > 0.0
 
 
 def _equal(a: float, b: float) -> bool:

@@ -84,13 +84,7 @@ def _verdicts(figures: dict[str, Any]) -> Table:
     ):
         _row(table, name, _STABLE[verdict["stable"]], verdict["theorem"], verdict["reason"])
     limit = figures["convergence"]
-    _row(
-        table,
-        "convergence",
-        "converges" if limit["holds"] else _WORDS[limit["holds"]],
-        limit["theorem"],
-        limit["reason"],
-    )
+    _row(table, "convergence", "yes" if limit["holds"] else "not decided", limit["theorem"], limit["reason"])
     return table
 
 
