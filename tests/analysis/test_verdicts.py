@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from testbed.analysis.verdicts import analyze, vanishing_input
 from testbed.scenario import parse_scenario
@@ -176,3 +179,26 @@ def test_convergence(source: dict[str, Any] | None, vanishes: bool | None) -> No
     assert analyze(scenario)["convergence"]["holds"] is (True if vanishes else None)
     lossy = figures(M, bernoulli(0.9), estimators=[{"name": "aoe"}], **rest)
     assert lossy["convergence"]["holds"] is None
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 4),
+    st.integers(1, 3),
+    st.sampled_from([1.0, 1e-160, 1e8, 1e100, 1e200, 1e300]),
+    st.sampled_from([0.0, 1e-12, 0.5, 1.0]),
+    st.sampled_from([1e-12, 0.3, 1.0]),
+)
+def test_any_scenario_gives_json(seed: int, n: int, p: int, scale: float, recovery: float, failure: float) -> None:
+    rng = np.random.default_rng(seed)
+    A = rng.integers(-2, 3, (n, n)) * scale
+    system = {"A": A.tolist(), "C": rng.integers(-1, 2, (p, n)).tolist()}
+    system |= {"Q": np.diag(rng.integers(0, 2, n)).tolist(), "R": np.eye(p).tolist()}
+    found = figures(system, markov(recovery, failure))
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    order = found["moments"]["order"]
+    if found["observation"]["stable"] and order is not None:
+        assert order > 1
+    if found["moments"]["finite_variance"]:
+        assert found["moments"]["finite_mean"]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from testbed.analysis.moments import spectral_radius
 from testbed.numerics.lanes import Floats
 
 SERIES_TOLERANCE = 1e-12
@@ -21,6 +23,14 @@ class Series:
     tail: float
 
 
+def _squared_norm(matrix: Floats) -> float:
+    """‖·‖² of a matrix (n, n); infinite where it overflows."""
+    if not np.isfinite(matrix).all():
+        return math.inf
+    size = float(np.linalg.norm(matrix, 2))
+    return size * size
+
+
 def growth_factors(A: Floats, index: int) -> tuple[float, ...]:
     """d_1 … d_{max(I0−1, 1)} of P (16), A (n, n), I0 = ``index``: ‖F^i(P)‖ ≤ d_i ‖P‖ + const.
 
@@ -30,7 +40,7 @@ def growth_factors(A: Floats, index: int) -> tuple[float, ...]:
         return (0.0,)
     out, power = [], A
     for _ in range(index - 1):
-        out.append(float(np.linalg.norm(power, 2)) ** 2)
+        out.append(_squared_norm(power))
         power = power @ A
     return tuple(out)
 
@@ -42,7 +52,8 @@ def burst_series(A: Floats, recovery: float) -> Series | None:
     term N is at most (terms N+1 … N+m) / (1−θ). At most 200000 terms are summed.
     """
     s = 1.0 - recovery
-    if float(np.max(np.abs(np.linalg.eigvals(A)))) ** 2 * s >= 1.0:
+    rho = spectral_radius(A)
+    if s > 0.0 and rho * rho * s >= 1.0:
         return None
     power, total, terms = A, 0.0, 0
     block, theta = _first_contraction(A, s)
@@ -51,8 +62,10 @@ def burst_series(A: Floats, recovery: float) -> Series | None:
     while terms < _TERMS_MAX:
         part = 0.0
         for _ in range(block):
-            part += float(np.linalg.norm(power, 2)) ** 2
+            part += _squared_norm(power)
             power = np.sqrt(s) * (A @ power)
+        if not math.isfinite(part):
+            return None
         tail = part * theta / (1.0 - theta)
         total, terms = total + part, terms + block
         if tail <= SERIES_TOLERANCE * total:
@@ -64,7 +77,7 @@ def _first_contraction(A: Floats, s: float) -> tuple[int | None, float]:
     """The first m of 1, 2, 4, … with θ = ‖A^m‖² s^m ≤ ½, and θ; (None, 1) if there is none up to 2^15."""
     power, m = np.sqrt(s) * A, 1
     while m <= 2**15:
-        theta = float(np.linalg.norm(power, 2)) ** 2
+        theta = _squared_norm(power)
         if theta <= 0.5:
             return m, theta
         if not np.isfinite(theta):
@@ -82,7 +95,8 @@ def condition_two(d: tuple[float, ...], index: int, series: float, recovery: flo
 def failure_limit(d: tuple[float, ...], index: int, series: float, recovery: float) -> float:
     """The p up to which P Theorem 6 (ii) holds for every failure rate below; 1 if it holds for all.
 
-    The first root in 0 … 1 of a polynomial of degree I0, from all its roots.
+    The first root in 0 … 1 of a polynomial of degree I0, from all its roots. Where they overflow, the smaller
+    1 / (q d_1 [1 + Σ d_i] Σ_j …), below which the condition holds too.
     """
     factor = recovery * d[0] * series
     if factor == 0.0:
@@ -91,11 +105,16 @@ def failure_limit(d: tuple[float, ...], index: int, series: float, recovery: flo
     for i in range(1, index):
         inner = inner + d[i - 1] * np.polynomial.Polynomial([1.0, -1.0]) ** i
     left = np.polynomial.Polynomial([0.0, factor]) * inner
-    roots = [complex(root) for root in (left - 1.0).roots()]
+    try:
+        roots = [complex(root) for root in (left - 1.0).roots()]
+    except np.linalg.LinAlgError:
+        return min(1.0, 1.0 / (factor * (1.0 + sum(d[: index - 1]))))
     inside = [root.real for root in roots if abs(root.imag) < 1e-9 and 0.0 < root.real <= 1.0]
     return min(inside, default=1.0)
 
 
 def scalar_peak_is_stable(a: float, recovery: float, order: float = 1.0) -> bool:
     """P Theorem 8 (order 1) and Corollary 9: |a|^{2r} (1−q) < 1, necessary and sufficient for c ≠ 0, Q > 0."""
-    return bool(abs(a) ** (2.0 * order) * (1.0 - recovery) < 1.0)
+    if a == 0.0 or recovery >= 1.0:
+        return True
+    return 2.0 * order * math.log(abs(a)) + math.log1p(-recovery) < 0.0

@@ -75,6 +75,10 @@ class Facts:
         """Whether the noise reaches every eigenvalue outside the open unit disc."""
         return self.controllable.stable_rest
 
+    def growth(self, chain: Chain) -> float:
+        """ρ² (1 − recovery): what a burst grows by, times the probability that it goes on; maybe infinite."""
+        return self.radius * self.radius * (1.0 - chain.recovery) if chain.recovery < 1.0 else 0.0
+
     def strongly(self, chain: Chain) -> bool:
         """Whether M Theorem 5 applies: M Assumptions 1 (controllable, observable, the chain irreducible) and 2."""
         structure = self.controllable.full and self.observable.full and self.strong.holds
@@ -93,7 +97,12 @@ def analyze(scenario: Scenario) -> dict[str, Any]:
     if system.G is not None:
         G = np.array(system.G)
         Q = G @ Q @ G.T
-    facts = Facts.of(A, C, Q)
+    with np.errstate(all="ignore"):  # what overflows is infinite, and infinite is taken care of
+        return _figures(scenario, Facts.of(A, C, Q))
+
+
+def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
+    A = facts.A
     observed, controlled = scenario.links.observation.loss, scenario.links.control.loss
     chain = chain_of(observed)
     verdict = observation_verdict(facts, chain)
@@ -149,7 +158,7 @@ def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
     if not facts.noise_feeds_growth:
         return Verdict(None, "none", "(A, sqrt Q) is not stabilisable: no theorem here applies")
     threshold = recovery_threshold(facts.A)
-    growth = f"ρ²(1 − recovery) = {facts.radius**2 * (1.0 - chain.recovery):.6g}"
+    growth = f"ρ²(1 − recovery) = {facts.growth(chain):.6g}"
     if threshold == 0.0 and chain.recovery > 0.0:
         return _marginal(facts, chain)
     if _equal(chain.recovery, threshold):
@@ -199,10 +208,10 @@ def peak_figures(facts: Facts, chain: Chain) -> dict[str, Any]:
     out |= {"failure_max": None, "critical_recovery": recovery_threshold(facts.A)}
     if not facts.observable.full:
         return {**out, **Verdict(None, "P Theorem 6", "(A, C) is not observable").table()}
-    index, condition_i = facts.observable.index, facts.radius**2 * (1.0 - chain.recovery) < 1.0
+    index, condition_i = facts.observable.index, facts.growth(chain) < 1.0
     d = growth_factors(facts.A, index)
-    out |= {"condition_i": condition_i, "d": list(d)}
-    series = burst_series(facts.A, chain.recovery) if condition_i else None
+    out |= {"condition_i": condition_i, "d": [_finite(value) for value in d]}
+    series = burst_series(facts.A, chain.recovery) if condition_i and math.isfinite(max(d)) else None
     if series is not None:
         left = condition_two(d, index, series.value + series.tail, chain.recovery, chain.failure)
         out |= {"series": series.value, "series_tail": series.tail, "left_side": left, "condition_ii": left < 1.0}
@@ -215,7 +224,7 @@ def peak_figures(facts: Facts, chain: Chain) -> dict[str, Any]:
 def _peak_verdict(facts: Facts, chain: Chain, first: bool, second: bool | None) -> Verdict:
     if not (0.0 < chain.failure < 1.0 and 0.0 < chain.recovery < 1.0):
         return Verdict(None, "P Theorem 6", "recovery and failure are not both inside 0 … 1")
-    growth = f"ρ²(1 − recovery) = {facts.radius**2 * (1.0 - chain.recovery):.6g}"
+    growth = f"ρ²(1 − recovery) = {facts.growth(chain):.6g}"
     if facts.scalar:
         stable = scalar_peak_is_stable(float(facts.A[0, 0]), chain.recovery)
         return Verdict(stable, "P Theorem 8", f"{growth}: {'< 1' if stable else 'not < 1'}, necessary and sufficient")

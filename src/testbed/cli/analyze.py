@@ -36,6 +36,7 @@ def analyze(
     console = Console(highlight=False)
     console.print(figures["name"], style="bold", markup=False)
     console.print(_facts(figures))
+    console.print()
     console.print(_verdicts(figures))
 
 
