@@ -98,7 +98,8 @@ def analyze(scenario: Scenario) -> dict[str, Any]:
         G = np.array(system.G)
         Q = G @ Q @ G.T
     with np.errstate(all="ignore"):  # what overflows is infinite, and infinite is taken care of
-        return _figures(scenario, Facts.of(A, C, Q))
+        figures: dict[str, Any] = _plain(_figures(scenario, Facts.of(A, C, Q)))
+    return figures
 
 
 def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
@@ -210,7 +211,7 @@ def peak_figures(facts: Facts, chain: Chain) -> dict[str, Any]:
         return {**out, **Verdict(None, "P Theorem 6", "(A, C) is not observable").table()}
     index, condition_i = facts.observable.index, facts.growth(chain) < 1.0
     d = growth_factors(facts.A, index)
-    out |= {"condition_i": condition_i, "d": [_finite(value) for value in d]}
+    out |= {"condition_i": condition_i, "d": list(d)}
     series = burst_series(facts.A, chain.recovery) if condition_i and math.isfinite(max(d)) else None
     if series is not None:
         left = condition_two(d, index, series.value + series.tail, chain.recovery, chain.failure)
@@ -257,7 +258,7 @@ def moment_figures(facts: Facts, chain: Chain, observation: Verdict) -> dict[str
         return True if sufficient and order > r and facts.radius > 1.0 and chain.recovery > 0.0 else None
 
     return {
-        "order": None if math.isinf(order) else order,
+        "order": order,
         "finite_mean": observation.stable if finite(1.0) is None else finite(1.0),
         "finite_variance": finite(2.0),
     }
@@ -326,14 +327,19 @@ def _link(loss: Loss, chain: Chain) -> dict[str, Any]:
         "recovery": chain.recovery,
         "failure": chain.failure,
         "stationary_loss": 1.0 - chain.arrival,
-        "mean_burst": _finite(bad.mean) if loses else None,
+        "mean_burst": bad.mean if loses else None,
         "burst_99": bad.quantile(0.99) if loses else None,
-        "mean_good_run": _finite(good.mean),
+        "mean_good_run": good.mean,
     }
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _plain(value: Any) -> Any:
+    """``value`` with None for every number that is not finite."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _pair(value: complex) -> list[float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_format
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -108,13 +109,13 @@ def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.6g}"
 
 
-def _eigenvalues(pairs: list[list[float]]) -> str:
+def _eigenvalues(pairs: list[list[float | None]]) -> str:
     from testbed.analysis.strong import shown
 
-    return ", ".join(shown(complex(*pair)) for pair in pairs) or "none"
+    return ", ".join(shown(complex(*(math.inf if part is None else part for part in pair))) for pair in pairs) or "none"
 
 
-def _holds(holds: bool, failing: list[list[float]]) -> str:
+def _holds(holds: bool, failing: list[list[float | None]]) -> str:
     return "yes" if holds else f"no: fails at {_eigenvalues(failing)}"
 
 
