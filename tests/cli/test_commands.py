@@ -30,10 +30,10 @@ def test_help_and_version(testbed: Command) -> None:
     for arguments in ((), ("--help",)):
         shown = testbed(*arguments)
         assert (shown.code, shown.err) == (0, "")
-        for name in ("run", "replay", "schema", "link"):
+        for name in ("run", "analyze", "replay", "schema", "link"):
             assert name in shown.out
     assert testbed("--version").out == f"testbed {__version__}\n"
-    for command in ("run", "replay", "schema", "link"):
+    for command in ("run", "analyze", "replay", "schema", "link"):
         assert testbed(command, "--help").code == 0
 
 
@@ -191,6 +191,39 @@ def test_a_sample_in_words(testbed: Command) -> None:
     assert shown.out.startswith("control: 2000 sent, ")
     assert "(expected 0.3)" in shown.out
     assert len(shown.out.splitlines()) == 1
+
+
+def test_analyze_prints_figures_as_json(testbed: Command) -> None:
+    shown = testbed("analyze", "s.toml", "--json")
+    assert (shown.code, shown.err) == (0, "")
+    figures = json.loads(shown.out)
+    assert figures["spectral_radius"] == pytest.approx(1.1)
+    assert figures["critical_arrival"]["exact"] == pytest.approx(1 - 1 / 1.21)
+    assert figures["observation"]["stationary_loss"] == pytest.approx(2 / 9)
+    assert figures["observation"]["mean_burst"] == pytest.approx(1 / 0.7)
+    assert (figures["observation"]["stable"], figures["control"]["stable"]) == (True, True)
+
+
+def test_analyze_for_a_person(testbed: Command, tmp_path: Path) -> None:
+    shown = testbed("analyze", "s.toml")
+    assert (shown.code, shown.err) == (0, "")
+    for text in ("small", "spectral radius", "P Lemma 5", "stable", "D Theorem 2", "no: fails at 0.7"):
+        assert text in shown.out
+    assert max(map(len, shown.out.splitlines())) <= 80
+    system = {"A": [[0.0, 1.3, 0.0], [-1.3, 0.0, 0.0], [0.0, 0.0, 1.1]], "C": [[1.0, 0.0, 0.0]], "R": [[1.0]]}
+    system["Q"] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    write(tmp_path / "[b]odd.toml", name="[b]odd", system=system, input=None, links=None)
+    odd = testbed("analyze", "[b]odd.toml")
+    assert odd.code == 0
+    assert odd.out.startswith("[b]odd\n")
+    assert "no: fails at 1.1" in odd.out
+    assert "unstable" in odd.out
+
+
+def test_analyze_refuses_as_every_command(testbed: Command) -> None:
+    shown = testbed("analyze", "none.toml")
+    assert (shown.code, shown.out) == (2, "")
+    assert shown.err == "testbed: none.toml: no such file\n"
 
 
 @pytest.mark.parametrize("what", ["scenario", "messages", "summary"])

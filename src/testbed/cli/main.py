@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from testbed import __version__
-from testbed.cli import link, replay, run, schema
+from testbed.cli import analyze, link, replay, run, schema
 from testbed.errors import TestbedError
 
 app = typer.Typer(
@@ -22,6 +22,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.command("run")(run.run)
+app.command("analyze")(analyze.analyze)
 app.command("replay")(replay.replay)
 app.command("schema")(schema.schema)
 app.add_typer(link.app, name="link")

@@ -1,0 +1,346 @@
+"""What the theorems say of one scenario: stable, unstable or not decided, and by which theorem."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from testbed.analysis.bursts import delivered_run, lost_run
+from testbed.analysis.critical import CriticalArrival, critical_arrival, observed_at_once, recovery_threshold
+from testbed.analysis.moments import finite_moment_order, spectral_radius
+from testbed.analysis.peak import burst_series, condition_two, failure_limit, growth_factors, scalar_peak_is_stable
+from testbed.analysis.strong import StrongObservability, strong_observability
+from testbed.analysis.structure import Reach, controllability, observability, unstable_eigenvalues
+from testbed.channel.chains import chain_of
+from testbed.channel.loss import Chain
+from testbed.numerics.lanes import Floats
+from testbed.scenario import (
+    ConstantInput,
+    ExponentialInput,
+    FeedbackInput,
+    Input,
+    Links,
+    Loss,
+    Scenario,
+    SineInput,
+    UniformInput,
+)
+
+_AT_THRESHOLD = 1e-9
+"""Relative distance below which a rate counts as equal to its threshold; no theorem decides there."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """``stable``: True, False, or None for not decided; the theorem that says so, and why it applies or does not."""
+
+    stable: bool | None
+    theorem: str
+    reason: str
+
+    def table(self) -> dict[str, Any]:
+        return {"stable": self.stable, "theorem": self.theorem, "reason": self.reason}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the verdicts need of a system: A (n, n), C (p, n) and what was found out about them."""
+
+    A: Floats
+    C: Floats
+    radius: float
+    controllable: Reach
+    observable: Reach
+    strong: StrongObservability
+    critical: CriticalArrival
+
+    @classmethod
+    def of(cls, A: Floats, C: Floats, Q: Floats) -> Facts:
+        """Q (n, n): the covariance of the process noise as it enters the state, G Q G'."""
+        return cls(
+            A,
+            C,
+            spectral_radius(A),
+            controllability(A, Q),
+            observability(A, C),
+            strong_observability(A, C),
+            critical_arrival(A, C),
+        )
+
+    @property
+    def noise_feeds_growth(self) -> bool:
+        """Whether the noise reaches every eigenvalue outside the open unit disc."""
+        return self.controllable.stable_rest
+
+    def growth(self, chain: Chain) -> float:
+        """ρ² (1 − recovery): what a burst grows by, times the probability that it goes on; maybe infinite."""
+        return self.radius * self.radius * (1.0 - chain.recovery) if chain.recovery < 1.0 else 0.0
+
+    def strongly(self, chain: Chain) -> bool:
+        """Whether M Theorem 5 applies: M Assumptions 1 (controllable, observable, the chain irreducible) and 2."""
+        structure = self.controllable.full and self.observable.full and self.strong.holds
+        return structure and chain.recovery > 0.0 and chain.failure > 0.0
+
+    @property
+    def scalar(self) -> bool:
+        """Whether P Theorem 8 applies: n = p = 1, c ≠ 0, Q > 0."""
+        return self.A.shape == (1, 1) == self.C.shape and self.observable.full and self.controllable.full
+
+
+def analyze(scenario: Scenario) -> dict[str, Any]:
+    """All that is said of a scenario, as tables, lists, texts, numbers and None; the keys are those of the command."""
+    system = scenario.system
+    A, C, Q = np.array(system.A), np.array(system.C), np.array(system.Q)
+    if system.G is not None:
+        G = np.array(system.G)
+        Q = G @ Q @ G.T
+    with np.errstate(all="ignore"):  # what overflows is infinite, and infinite is taken care of
+        figures: dict[str, Any] = _plain(_figures(scenario, Facts.of(A, C, Q)))
+    return figures
+
+
+def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
+    A = facts.A
+    observed, controlled = scenario.links.observation.loss, scenario.links.control.loss
+    chain = chain_of(observed)
+    verdict = observation_verdict(facts, chain)
+    return {
+        "name": scenario.name,
+        "spectral_radius": facts.radius,
+        "unstable_eigenvalues": [_pair(value) for value in unstable_eigenvalues(A)],
+        "controllable": facts.controllable.full,
+        "uncontrollable_eigenvalues": [_pair(value) for value in facts.controllable.failing],
+        "observable": facts.observable.full,
+        "unobservable_eigenvalues": [_pair(value) for value in facts.observable.failing],
+        "observability_index": facts.observable.index if facts.observable.full else None,
+        "strongly_observable": {
+            "holds": facts.strong.holds,
+            "reason": facts.strong.reason,
+            "failing": [_pair(value) for value in facts.strong.failing],
+        },
+        "critical_arrival": {
+            "lower": facts.critical.lower,
+            "upper": facts.critical.upper,
+            "exact": facts.critical.exact,
+            "reason": facts.critical.reason,
+        },
+        "critical_recovery": recovery_threshold(A),
+        "observation": {**_link(observed, chain), **verdict.table()},
+        "control": {
+            **_link(controlled, chain_of(controlled)),
+            **control_verdict(verdict, chain_of(controlled), scenario.input, scenario.links).table(),
+        },
+        "bounds": {
+            "lower": Verdict(verdict.stable, verdict.theorem, f"covariance with every ACK: {verdict.reason}").table(),
+            "upper": upper_bound_verdict(verdict, scenario.input).table(),
+        },
+        "peak": peak_figures(facts, chain),
+        "moments": moment_figures(facts, chain, verdict),
+        "convergence": convergence(facts, chain, scenario.input),
+    }
+
+
+def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
+    """Whether the expected covariance with every ACK stays bounded, for the observation link ``chain``."""
+    if facts.radius < 1.0:
+        return Verdict(True, "ρ(A) < 1", "the covariance stays bounded without any observation")
+    if not facts.observable.stable_rest:
+        listed = "an eigenvalue on or outside the unit circle is not observed"
+        if not facts.noise_feeds_growth:
+            return Verdict(None, "none", f"{listed}, and the noise does not reach all that grows")
+        return Verdict(False, "detectability", f"{listed}: no link helps")
+    if chain.never_loses:
+        if facts.noise_feeds_growth:
+            return Verdict(True, "Kalman filter", "(A, C) is detectable and nothing is lost")
+        return Verdict(None, "none", "no losses, but the noise does not reach all that grows")
+    if not facts.noise_feeds_growth:
+        return Verdict(None, "none", "(A, sqrt Q) is not stabilisable: no theorem here applies")
+    threshold = recovery_threshold(facts.A)
+    growth = f"ρ²(1 − recovery) = {facts.growth(chain):.6g}"
+    if threshold == 0.0 and chain.recovery > 0.0:
+        return _marginal(facts, chain)
+    if _equal(chain.recovery, threshold):
+        return Verdict(None, "none", f"{growth}: at the threshold {threshold:.6g}, which no theorem decides")
+    if chain.recovery < threshold:
+        general = "Sinopoli lower bound" if chain.independent else "bound 1 − ρ^{-2}"
+        theorem = "M Theorem 5" if facts.strongly(chain) else general
+        return Verdict(False, theorem, f"{growth} > 1: a burst of losses outgrows its probability")
+    below = f"{growth} < 1"
+    if facts.strongly(chain):
+        return Verdict(True, "M Theorem 5", f"{below}, strongly observable, (A, sqrt Q) controllable")
+    if observed_at_once(facts.A, facts.C):
+        return Verdict(True, "P Lemma 5", f"{below}, one observation determines the unstable part")
+    upper = facts.critical.upper
+    if chain.independent and upper is not None and chain.arrival > upper:
+        reason = f"arrival {chain.arrival:.6g} > {upper:.6g}, where the modified Riccati equation has a solution"
+        return Verdict(True, "Sinopoli upper bound", reason)
+    why = "between the two bounds" if chain.independent else "necessary; not strongly observable, so not sufficient"
+    return Verdict(None, "none", f"{below}: {why}; {facts.strong.reason}")
+
+
+def control_verdict(observation: Verdict, chain: Chain, source: Input | None, links: Links) -> Verdict:
+    """Whether losses of controls leave the expected covariance of OE and AOE bounded (D Theorem 2, M Theorem 4)."""
+    if source is None or chain.never_loses or links.ack.mode == "perfect":
+        known = "there is no input" if source is None else "the fate of every control packet is known"
+        return Verdict(observation.stable, "separation", f"{known}: as with the observation link alone")
+    theorem = "D Theorem 2" if chain.independent else "M Theorem 4"
+    if isinstance(source, FeedbackInput):
+        return Verdict(
+            False if observation.stable is False else None, theorem, "u is fed back, so that its bound is not known"
+        )
+    return Verdict(
+        observation.stable, theorem, "u is bounded: control losses change the covariance, not whether it is bounded"
+    )
+
+
+def upper_bound_verdict(observation: Verdict, source: Input | None) -> Verdict:
+    """The bound S of M Theorem 3: the recursion with every ACK, with ¼ U added to Q."""
+    if isinstance(source, FeedbackInput):
+        return Verdict(None, "M Theorem 3", "u is fed back: no U ≥ B u u' B' is known")
+    return Verdict(observation.stable, "M Theorem 3", "the recursion with every ACK, and ¼ U more noise")
+
+
+def peak_figures(facts: Facts, chain: Chain) -> dict[str, Any]:
+    """P Theorem 6, and Theorem 8 for scalar systems."""
+    out: dict[str, Any] = dict.fromkeys(("condition_i", "condition_ii", "left_side", "d", "series", "series_tail"))
+    out |= {"failure_max": None, "critical_recovery": recovery_threshold(facts.A)}
+    if not facts.observable.full:
+        return {**out, **Verdict(None, "P Theorem 6", "(A, C) is not observable").table()}
+    index, condition_i = facts.observable.index, facts.growth(chain) < 1.0
+    d = growth_factors(facts.A, index)
+    out |= {"condition_i": condition_i, "d": list(d)}
+    series = burst_series(facts.A, chain.recovery) if condition_i and math.isfinite(max(d)) else None
+    if series is not None:
+        left = condition_two(d, index, series.value + series.tail, chain.recovery, chain.failure)
+        out |= {"series": series.value, "series_tail": series.tail, "left_side": left, "condition_ii": left < 1.0}
+        out["failure_max"] = failure_limit(d, index, series.value + series.tail, chain.recovery)
+    elif condition_i and index == 1:
+        out |= {"left_side": 0.0, "condition_ii": True, "failure_max": 1.0}
+    return {**out, **_peak_verdict(facts, chain, condition_i, out["condition_ii"]).table()}
+
+
+def _peak_verdict(facts: Facts, chain: Chain, first: bool, second: bool | None) -> Verdict:
+    if not (0.0 < chain.failure < 1.0 and 0.0 < chain.recovery < 1.0):
+        return Verdict(None, "P Theorem 6", "recovery and failure are not both inside 0 … 1")
+    growth = f"ρ²(1 − recovery) = {facts.growth(chain):.6g}"
+    if facts.scalar:
+        stable = scalar_peak_is_stable(float(facts.A[0, 0]), chain.recovery)
+        return Verdict(stable, "P Theorem 8", f"{growth}: {'< 1' if stable else 'not < 1'}, necessary and sufficient")
+    if first and second:
+        name = "P Corollary 7" if facts.observable.index == 1 else "P Theorem 6"
+        return Verdict(True, name, f"{growth} < 1, and condition (ii) holds")
+    if not first:
+        return Verdict(None, "P Theorem 6", f"{growth}: condition (i) fails; it is sufficient only")
+    return Verdict(None, "P Theorem 6", "condition (ii) is not known to hold; it is sufficient only")
+
+
+def moment_figures(facts: Facts, chain: Chain, observation: Verdict) -> dict[str, Any]:
+    """Order of the finite moments of the covariance (P Corollary 9); None where nothing is decided.
+
+    Necessary in general. Sufficient for scalar systems, and where one observation determines the unstable part.
+    """
+    order = finite_moment_order(facts.A, chain)
+    bounded = facts.radius < 1.0 or (observation.stable is True and chain.never_loses)
+    sufficient = facts.scalar or (
+        observation.stable is True and facts.observable.stable_rest and observed_at_once(facts.A, facts.C)
+    )
+
+    def finite(r: float) -> bool | None:
+        if bounded:
+            return True
+        if observation.stable is False:
+            return False
+        if order <= r and facts.noise_feeds_growth:
+            return False
+        return True if sufficient and order > r and facts.radius > 1.0 and chain.recovery > 0.0 else None
+
+    return {
+        "order": order,
+        "finite_mean": observation.stable if finite(1.0) is None else finite(1.0),
+        "finite_variance": finite(2.0),
+    }
+
+
+def convergence(facts: Facts, observation: Chain, source: Input | None) -> dict[str, Any]:
+    """D Theorem 3: without losses of observations, and with u_k → 0, E[P̄_k] tends to the solution of the ARE.
+
+    ``holds`` is None where the premises are not met or not known: the theorem gives no converse.
+    """
+
+    def answer(holds: bool | None, exponential: bool, reason: str) -> dict[str, Any]:
+        return {"holds": holds, "exponential": exponential, "theorem": "D Theorem 3", "reason": reason}
+
+    if not observation.never_loses:
+        return answer(None, False, "observations are lost")
+    if not (facts.observable.full and facts.controllable.full):
+        return answer(None, False, "(A, C) is not observable, or (A, sqrt Q) not controllable")
+    vanishes, text = vanishing_input(source)
+    if vanishes:
+        return answer(True, True, f"no observation is lost and {text}")
+    return answer(None, False, text)
+
+
+def vanishing_input(source: Input | None) -> tuple[bool | None, str]:
+    """Whether u_k → 0 (each kind that does so does it exponentially), None if unknown, and why, from the kind."""
+    if source is None:
+        return True, "there is no input"
+    if isinstance(source, ConstantInput):
+        zero = _zero(source.value)
+        return zero, "u = 0" if zero else "u is constant and not zero"
+    if isinstance(source, ExponentialInput):
+        zero = _zero(source.offset)
+        return zero, "u tends to 0 exponentially" if zero else "u tends to an offset that is not zero"
+    if isinstance(source, SineInput):
+        zero = _zero(source.offset) and _zero(source.amplitude)
+        return zero, "u = 0" if zero else "u is a sine: it does not tend to 0"
+    if isinstance(source, UniformInput):
+        zero = _zero(source.low) and _zero(source.high)
+        return zero, "u = 0" if zero else "u is drawn afresh at each step: it does not tend to 0"
+    kind = "fed back" if isinstance(source, FeedbackInput) else "a table of finite length"
+    return None, f"u is {kind}: its limit is not known"
+
+
+def _marginal(facts: Facts, chain: Chain) -> Verdict:
+    """ρ(A) = 1: nothing grows exponentially."""
+    if facts.strongly(chain):
+        return Verdict(True, "M Theorem 5", "ρ(A) = 1, recovery > 0, strongly observable")
+    return Verdict(None, "none", f"ρ(A) = 1, and the premises of M Theorem 5 do not hold: {facts.strong.reason}")
+
+
+def _equal(a: float, b: float) -> bool:
+    return math.isclose(a, b, rel_tol=_AT_THRESHOLD)
+
+
+def _zero(value: float | tuple[float, ...]) -> bool:
+    return not np.any(value)
+
+
+def _link(loss: Loss, chain: Chain) -> dict[str, Any]:
+    """The figures of a link's losses; lengths that are infinite, or of what never comes, are None."""
+    bad, good = lost_run(chain), delivered_run(chain)
+    loses = not chain.never_loses
+    return {
+        "kind": loss.kind,
+        "recovery": chain.recovery,
+        "failure": chain.failure,
+        "stationary_loss": 1.0 - chain.arrival,
+        "mean_burst": bad.mean if loses else None,
+        "burst_99": bad.quantile(0.99) if loses else None,
+        "mean_good_run": good.mean,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """``value`` with None for every number that is not finite."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _pair(value: complex) -> list[float]:
+    return [value.real, value.imag]
