@@ -103,7 +103,7 @@ def test_a_wrong_command_line(arguments: list[str], expected: str, testbed: Comm
         ({"estimators": []}, "the scenario has no [[estimators]]"),
         (
             {"estimators": [{"name": "kalman"}]},
-            "estimators.kalman: unknown estimator 'kalman'; allowed: aoe, ff, kfio, oe",
+            "estimators.kalman: unknown estimator 'kalman'; allowed: aoe, ff, kf, kfio, oe, rse, rseio, rsemm",
         ),
         ({"estimators": [{"name": "aoe", "depht": 1}]}, "estimators.aoe: estimator 'aoe': unknown option 'depht'"),
         (

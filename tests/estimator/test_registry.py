@@ -70,10 +70,10 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_kinds_are_those_built_in_and_those_registered() -> None:
-    assert kinds() == ["aoe", "ff", "function", "kfio", "oe", "silly"]
+    assert kinds() == ["aoe", "ff", "function", "kf", "kfio", "oe", "rse", "rseio", "rsemm", "silly"]
 
 
-@pytest.mark.parametrize("kind", ["aoe", "ff", "kfio", "oe"])
+@pytest.mark.parametrize("kind", ["aoe", "ff", "kf", "kfio", "oe", "rse", "rseio", "rsemm"])
 @pytest.mark.parametrize("lanes", [1, 3])
 def test_every_built_in_estimator_keeps_the_protocol(kind: str, lanes: int) -> None:
     made = create(kind, MODEL, lanes=lanes)
@@ -98,8 +98,16 @@ def test_a_registered_name_does_not_replace_a_built_in_one() -> None:
 @pytest.mark.parametrize(
     ("kind", "options", "expected"),
     [
-        ("silli", {}, "unknown estimator 'silli'; allowed: aoe, ff, function, kfio, oe, silly; did you mean 'silly'?"),
-        ("kalman", {}, "unknown estimator 'kalman'; allowed: aoe, ff, function, kfio, oe, silly"),
+        (
+            "silli",
+            {},
+            "unknown estimator 'silli'; allowed: aoe, ff, function, kf, kfio, oe, rse, rseio, rsemm, silly; did you mean 'silly'?",
+        ),
+        (
+            "kalman",
+            {},
+            "unknown estimator 'kalman'; allowed: aoe, ff, function, kf, kfio, oe, rse, rseio, rsemm, silly",
+        ),
         ("aoe", {"depth": 1}, "estimator 'aoe': unknown option 'depth'; allowed: none"),
         (
             "oe",

@@ -23,8 +23,12 @@ from testbed.scenario import EstimatorSpec, Scenario
 _BUILT_IN = {
     "aoe": "testbed.estimator.aoe:Aoe",
     "ff": "testbed.estimator.ff:Ff",
+    "kf": "testbed.estimator.kf:Kf",
     "kfio": "testbed.estimator.kfio:Kfio",
     "oe": "testbed.estimator.oe:Oe",
+    "rse": "testbed.estimator.rse:Rse",
+    "rseio": "testbed.estimator.rseio:Rseio",
+    "rsemm": "testbed.estimator.rsemm:Rsemm",
 }
 GROUP = "testbed.estimators"
 
@@ -61,6 +65,8 @@ def model_of(scenario: Scenario) -> Model:
     """What estimators know of a scenario."""
     system = scenario.system
     g = np.eye(system.n) if system.G is None else np.array(system.G)
+    uncertainty = scenario.uncertainty
+    d_a, d_g, d_c = (uncertainty.dA, uncertainty.dG, uncertainty.dC) if uncertainty is not None else ((), (), ())
     return Model(
         A=np.array(system.A),
         B=None if system.B is None else np.array(system.B),
@@ -70,6 +76,12 @@ def model_of(scenario: Scenario) -> Model:
         x0_mean=np.array(system.x0_mean),
         P0=np.array(system.P0),
         control=chain_of(scenario.links.control.loss),
+        observation=chain_of(scenario.links.observation.loss),
+        G=g,
+        W=np.array(system.Q),
+        dA=tuple(np.array(d) for d in d_a),
+        dG=tuple(np.array(d) for d in d_g),
+        dC=tuple(np.array(d) for d in d_c),
     )
 
 
