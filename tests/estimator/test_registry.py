@@ -101,7 +101,8 @@ def test_a_registered_name_does_not_replace_a_built_in_one() -> None:
         (
             "silli",
             {},
-            "unknown estimator 'silli'; allowed: aoe, ff, function, kf, kfio, oe, rse, rseio, rsemm, silly; did you mean 'silly'?",
+            "unknown estimator 'silli'; allowed: aoe, ff, function, kf, kfio, oe, rse, rseio, rsemm, silly; "
+            "did you mean 'silly'?",
         ),
         (
             "kalman",

@@ -67,7 +67,8 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     # model error
     (
         {"uncertainty": {}},
-        "uncertainty.delta: missing; needed: Each parameter is drawn from -delta … delta, at every step and in every lane",
+        "uncertainty.delta: missing; needed: Each parameter is drawn from -delta … delta, at every step "
+        "and in every lane",
     ),
     (
         {"uncertainty": {"delta": 1}},
@@ -89,7 +90,8 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"uncertainty": {"dA": [[1, 0], [0, 1]], "delta": 1}},
-        "uncertainty.dA[0]: got [1, 0]; allowed: nested arrays, one list for each row, such as [[1], [0]] (a column) or [[1, 0]] (a row) (and 1 more)",
+        "uncertainty.dA[0]: got [1, 0]; allowed: nested arrays, one list for each row, such as [[1], [0]] (a column) "
+        "or [[1, 0]] (a row) (and 1 more)",
     ),
     ({"uncertainty": {"dA": [[[1, 0]]], "delta": 1}}, "uncertainty.dA[0]: got 1 × 2; allowed: 2 × 2, the size of A"),
     ({"uncertainty": {"dG": [[[1], [0]]], "delta": 1}}, "uncertainty.dG[0]: got 2 × 1; allowed: 2 × 2, the size of G"),
