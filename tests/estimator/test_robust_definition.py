@@ -199,6 +199,25 @@ def test_rsemm_is_rse_with_the_mean_of_gamma_in_the_measurement() -> None:
         np.testing.assert_array_equal(found, wanted)
 
 
+def test_the_pseudo_covariance_forgets_where_it_began() -> None:
+    """R's second figure: from P_0 = 0.1, 1, 10 and 100 times I, with the same losses, P is the same at step 500."""
+    model = Model(
+        A=np.array([[0.9802, 0.0196], [0.0, 0.9802]]),
+        C=np.array([[1.0, -1.0]]),
+        Q=np.array([[1.9608, 0.0195], [0.0195, 1.9605]]),
+        R=np.eye(1),
+        x0_mean=np.array([1.0, 0.0]),
+        P0=np.eye(2),
+        dA=(np.array([[0.0, 0.099], [0.0, 0.0]]),),
+    )
+    arrived = (np.random.default_rng(1).random((500, 50)) < 0.8).astype(np.uint8)
+    y = np.zeros((500, 50, 1))
+    ends = [drive("rseio", replace(model, P0=p * np.eye(2)), y, arrived)[1][-1] for p in (0.1, 1.0, 10.0, 100.0)]
+    assert np.std(ends[0][:, 0, 0]) > 0.1  # it goes on moving with the losses
+    for P in ends[1:]:
+        np.testing.assert_allclose(P, ends[0], rtol=1e-9)
+
+
 @pytest.mark.parametrize("kind", ["kf", "rse", "rseio", "rsemm"])
 @pytest.mark.parametrize("q", [0, 2])
 def test_a_split_of_the_lanes_changes_no_bit(kind: str, q: int) -> None:
