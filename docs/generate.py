@@ -30,6 +30,7 @@ Schema = dict[str, Any]
 SCENARIO_TABLES = (
     ("Scenario", "The top of the file", ""),
     ("System", "`[system]`", "x_{k+1} = A x_k + ν_k B u_k + G w_k, y_k = C x_k + v_k."),
+    ("Uncertainty", "`[uncertainty]`", "A(ε) = A + Σ ε_k dA_k, and so for G and C."),
     ("ConstantInput", '`[input]`, `kind = "constant"`', ""),
     ("ExponentialInput", '`[input]`, `kind = "exponential"`', ""),
     ("SineInput", '`[input]`, `kind = "sine"`', ""),
@@ -37,7 +38,8 @@ SCENARIO_TABLES = (
     ("TableInput", '`[input]`, `kind = "table"`', ""),
     ("FeedbackInput", '`[input]`, `kind = "feedback"`', ""),
     ("Links", "`[links]`", ""),
-    ("Link", "`[links.control]`, `[links.observation]`", ""),
+    ("Link", "`[links.control]`", ""),
+    ("ObservationLink", "`[links.observation]`", ""),
     ("AckLink", "`[links.ack]`", ""),
     ("NoLoss", '`loss = { kind = "none" }`', ""),
     ("BernoulliLoss", '`loss = { kind = "bernoulli", … }`', ""),
@@ -236,6 +238,8 @@ def _array(field: Schema) -> str:
     items = field.get("items", {})
     if "prefixItems" in field:
         return "list"
+    if items.get("items", {}).get("type") == "array":
+        return "list of matrices"
     if items.get("type") == "array":
         return "matrix" if items.get("items", {}).get("type") == "number" else "list of lists"
     return "list of tables" if "$ref" in items else f"list of {_type(items)}s"

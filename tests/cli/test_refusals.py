@@ -104,7 +104,7 @@ def test_a_wrong_command_line(arguments: list[str], expected: str, testbed: Comm
         (
             {"estimators": [{"name": "kalman"}]},
             "estimators.kalman: unknown estimator 'kalman'; "
-            "allowed: aoe, ff, gpb, gpb1, gpb2, imm, kf, kfio, lmmse, oe, oe-lattice, pf",
+            "allowed: aoe, ff, gpb, gpb1, gpb2, imm, kf, kfio, lmmse, oe, oe-lattice, pf, rse, rseio, rsemm",
         ),
         ({"estimators": [{"name": "aoe", "depht": 1}]}, "estimators.aoe: estimator 'aoe': unknown option 'depht'"),
         (

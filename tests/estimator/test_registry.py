@@ -24,7 +24,23 @@ def scenario(**changes: Any) -> Scenario:
 
 
 MODEL = model_of(scenario())
-BUILT_IN = ["aoe", "ff", "gpb", "gpb1", "gpb2", "imm", "kf", "kfio", "lmmse", "oe", "oe-lattice", "pf"]
+BUILT_IN = [
+    "aoe",
+    "ff",
+    "gpb",
+    "gpb1",
+    "gpb2",
+    "imm",
+    "kf",
+    "kfio",
+    "lmmse",
+    "oe",
+    "oe-lattice",
+    "pf",
+    "rse",
+    "rseio",
+    "rsemm",
+]
 ALLOWED = ", ".join(sorted([*BUILT_IN, "function", "silly"]))
 
 

@@ -49,6 +49,15 @@ def systems(draw: st.DrawFn, n: int, q: int, p: int) -> dict[str, Any]:
 
 
 @st.composite
+def uncertainties(draw: st.DrawFn, n: int, g: int, p: int) -> dict[str, Any]:
+    parameters = draw(st.integers(1, 3))
+    sizes = {"dA": (n, n), "dG": (n, g), "dC": (p, n)}
+    keys = draw(st.lists(st.sampled_from(sorted(sizes)), min_size=1, unique=True))
+    lists = {key: draw(st.lists(matrix(*sizes[key]), min_size=parameters, max_size=parameters)) for key in keys}
+    return {**lists, "delta": draw(st.floats(0, 1e6))}
+
+
+@st.composite
 def inputs(draw: st.DrawFn, n: int, q: int, steps: int, estimators: list[str]) -> dict[str, Any]:
     def channels(entries: st.SearchStrategy[float]) -> st.SearchStrategy[Any]:
         return entries | st.lists(entries, min_size=q, max_size=q)
@@ -83,6 +92,9 @@ losses: st.SearchStrategy[dict[str, Any]] = st.one_of(
     st.fixed_dictionaries({"kind": st.just("markov"), "loss": st.floats(0, 0.5), "mean_burst": st.floats(1, 1e6)}),
 )
 links = st.fixed_dictionaries({}, optional={"loss": losses})
+observation_links = st.fixed_dictionaries(
+    {}, optional={"loss": losses, "on_loss": st.sampled_from(["nothing", "noise"])}
+)
 acks = st.one_of(
     st.fixed_dictionaries({"mode": st.sampled_from(["none", "perfect"])}),
     st.fixed_dictionaries({"mode": st.just("link")}, optional={"loss": losses}),
@@ -125,6 +137,9 @@ def estimators(draw: st.DrawFn, steps: int) -> list[dict[str, Any]]:
 def scenarios(draw: st.DrawFn) -> dict[str, Any]:
     n, q, p, steps = (draw(st.integers(low, high)) for low, high in ((1, 3), (0, 2), (1, 3), (1, 5)))
     table: dict[str, Any] = {"system": draw(systems(n, q, p)), "steps": steps, "estimators": draw(estimators(steps))}
+    if draw(st.booleans()):
+        system = table["system"]
+        table["uncertainty"] = draw(uncertainties(n, len(system["Q"]), p))
     if q and draw(st.booleans()):
         complete = [spec["name"] for spec in table["estimators"] if "until" not in spec]
         table["input"] = draw(inputs(n, q, steps, complete))
@@ -135,7 +150,7 @@ def scenarios(draw: st.DrawFn) -> dict[str, Any]:
         "record": st.sampled_from(["first", "all", "none"]),
         "bounds": st.booleans(),
         "clock": clocks,
-        "links": st.fixed_dictionaries({}, optional={"control": links, "observation": links, "ack": acks}),
+        "links": st.fixed_dictionaries({}, optional={"control": links, "observation": observation_links, "ack": acks}),
         "transport": transports,
     }
     return {**table, **draw(st.fixed_dictionaries({}, optional=optional))}

@@ -61,10 +61,54 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ({"seed": -1, "steps": 0, "lane": 1}, "unknown key 'lane'; did you mean 'lanes'? (and 2 more)"),
     ({"steps": 0, "seed": -1, "record": 1}, "steps: got 0; allowed: an integer, 1 … 2147483647 (and 2 more)"),
     # later versions
-    ({"uncertainty": {}}, "key 'uncertainty' is not supported by this version"),
     ({"events": []}, "key 'events' is not supported by this version"),
     ({"links.ack.delay": "1 ms"}, "links.ack: key 'delay' is not supported by this version"),
     ({"clock.mode": "real"}, "clock.mode: got 'real'; not supported by this version; allowed: virtual"),
+    # model error
+    (
+        {"uncertainty": {}},
+        "uncertainty.delta: missing; needed: Each parameter is drawn from -delta … delta, at every step "
+        "and in every lane",
+    ),
+    (
+        {"uncertainty": {"delta": 1}},
+        "uncertainty: got none of dA, dG, dC; allowed: at least one of them, with a matrix for each parameter",
+    ),
+    (
+        {"uncertainty": {"dA": [], "delta": 1}},
+        "uncertainty: got none of dA, dG, dC; allowed: at least one of them, with a matrix for each parameter",
+    ),
+    ({"uncertainty": {"dA": [[[1, 0], [0, 1]]], "delta": -1}}, "uncertainty.delta: got -1; allowed: 0 or more"),
+    ({"uncertainty": {"dA": [[[1, 0], [0, 1]]], "delta": NAN}}, "uncertainty.delta: got nan; allowed: 0 or more"),
+    (
+        {"uncertainty": {"dA": 1, "delta": 1}},
+        "uncertainty.dA: got 1; allowed: a list of matrices, one for each parameter",
+    ),
+    (
+        {"uncertainty": {"dA": [[[1, 0], [0]]], "delta": 1}},
+        "uncertainty.dA[0][1]: got 1 number; allowed: 2 numbers, as in row 0",
+    ),
+    (
+        {"uncertainty": {"dA": [[1, 0], [0, 1]], "delta": 1}},
+        "uncertainty.dA[0]: got [1, 0]; allowed: nested arrays, one list for each row, such as [[1], [0]] (a column) "
+        "or [[1, 0]] (a row) (and 1 more)",
+    ),
+    ({"uncertainty": {"dA": [[[1, 0]]], "delta": 1}}, "uncertainty.dA[0]: got 1 × 2; allowed: 2 × 2, the size of A"),
+    ({"uncertainty": {"dG": [[[1], [0]]], "delta": 1}}, "uncertainty.dG[0]: got 2 × 1; allowed: 2 × 2, the size of G"),
+    (
+        {"uncertainty": {"dC": [[[1, 0]], [[1]]], "delta": 1}},
+        "uncertainty.dC[1]: got 1 × 1; allowed: 1 × 2, the size of C",
+    ),
+    (
+        {"uncertainty": {"dA": [[[1, 0], [0, 1]]], "dC": [[[1, 0]], [[0, 1]]], "delta": 1}},
+        "uncertainty.dC: got 2 parameters; allowed: 1, as many as dA has matrices",
+    ),
+    ({"uncertainty": {"da": [], "delta": 1}}, "uncertainty: unknown key 'da'; did you mean 'dA'?"),
+    (
+        {"links.observation.on_loss": "noize"},
+        "links.observation.on_loss: got 'noize'; allowed: nothing, noise; did you mean 'noise'?",
+    ),
+    ({"links.control.on_loss": "noise"}, "links.control: unknown key 'on_loss'; did you mean 'loss'?"),
     # losses
     ({f"{LOSS}.arrival": 0.5}, f"{LOSS}.kind: missing; allowed: none, bernoulli, markov"),
     (

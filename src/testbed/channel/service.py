@@ -48,6 +48,7 @@ class LinkService:
 
     A packet that arrives in some lanes is passed on with its mask and zeros elsewhere; one that arrives in none is
     passed on as a bare mask, which tells the receiver that the step is over (virtual time has no other way).
+    Where the scenario says that noise is received in place of a lost observation, that stands there with mask 0.
     """
 
     def __init__(self, node: Node, setup: Setup, *, link: LinkName) -> None:
@@ -55,7 +56,10 @@ class LinkService:
         self._losses = {lane: loss_process(setup.scenario, link, lane, lanes) for lane, lanes in setup.blocks}
         self._counts = LossCounts()
         self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
-        node.on(node.keys.sent(link), model, sender, self._pass_on, needs=(self._content,))
+        noise = link == "observation" and setup.scenario.links.observation.on_loss == "noise"
+        self._instead = "noise" if noise else None
+        needs = (self._content, self._instead) if self._instead else (self._content,)
+        node.on(node.keys.sent(link), model, sender, self._pass_on, needs=needs)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -68,6 +72,10 @@ class LinkService:
         self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
 
     def _content_of(self, arrays: dict[str, NDArray[Any]], arrived: Mask) -> dict[str, NDArray[Any]]:
+        if self._instead is not None:
+            mask = np.atleast_1d(np.asarray(arrived, dtype=np.bool_))
+            content = np.where(mask[:, None], arrays[self._content], arrays[self._instead])
+            return {self._content: content, "mask": mask.astype(np.uint8)}
         if not any_of(arrived):
             lanes = 1 if isinstance(arrived, bool) else len(arrived)
             return {"mask": np.zeros(lanes, dtype=np.uint8)}

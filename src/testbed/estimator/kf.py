@@ -1,12 +1,17 @@
-"""KF: the Kalman filter that takes every received y as a measurement, also one that is only noise (theory.md 3.8)."""
+"""KF: the Kalman filter that knows no γ and takes every y that it receives as a measurement (theory.md 3.7)."""
 
 from __future__ import annotations
+
+from typing import ClassVar
 
 from testbed.estimator.kfio import Kfio
 
 
 class Kf(Kfio):
-    """KFIO without the indicator γ: what a packet with γ = 0 brought is a measurement to it."""
+    """KFIO, but for what it takes as a measurement: noise too, where that is received in place of a lost packet.
 
-    kind = "kf"
-    takes_every_y = True
+    Its model is the nominal one. ν must be known, as for KFIO.
+    """
+
+    KIND: ClassVar[str] = "kf"
+    takes_noise: ClassVar[bool] = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,14 +38,18 @@ class Kfio:
     ν need not be acknowledged where the control link never loses or where B u = 0.
     """
 
-    kind = "kfio"
+    KIND: ClassVar[str] = "kfio"
 
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
-        self._advance = _stepper(model, lanes)
+        self._advance = self._stepper()
         self._x, self._p = model.prior(lanes)
         self._k = 0
         self.counters: dict[str, int] = {}
+
+    def _stepper(self) -> Step:
+        """What makes a step of (γ, x̂, P, B u, ν, y)."""
+        return _stepper(self._model, self._lanes)
 
     def check_scenario(self, scenario: Scenario, acks: str, until: int) -> None:
         """Raises UsageError where the scenario cannot give it every ν it needs."""
@@ -53,7 +57,7 @@ class Kfio:
         complete = acks == "perfect" or (acks == "link" and isinstance(link.loss, NoLoss))
         if not complete and not self._model.control.never_loses and self._model.q and not _zero(scenario.input):
             raise UsageError(
-                f"{self.kind} needs every ACK and gets {'none' if acks == 'none' else 'them over a lossy link'}; "
+                f"{self.KIND} needs every ACK and gets {'none' if acks == 'none' else 'them over a lossy link'}; "
                 'allowed: acks = "perfect" here, [links.ack] mode = "perfect", or another estimator (aoe, ff, oe)'
             )
 
@@ -76,7 +80,7 @@ class Kfio:
         idle = np.all([np.asarray(b) == 0.0 for b in push], axis=0) if push else np.True_
         if not np.all(known | idle):
             raise MissingAck(
-                f"{self.kind} needs the ACK of control packet {self._k - 1} at step {self._k} and none has come; "
+                f"{self.KIND} needs the ACK of control packet {self._k - 1} at step {self._k} and none has come; "
                 'give it acks = "perfect", or use aoe, ff or oe'
             )
         return nu

@@ -30,7 +30,11 @@ from testbed.numerics.lanes import (
 class Model:
     """x⁺ = A x + ν B u + w, y = C x + v (theory.md section 1); Q with G already applied.
 
-    A (n, n), B (n, q) or None, C (p, n), Q (n, n), R (p, p), x0_mean (n,), P0 (n, n); control: law of ν_0, ν_1, …
+    A (n, n), B (n, q) or None, C (p, n), Q (n, n), R (p, p), x0_mean (n,), P0 (n, n); control: law of ν_0, ν_1, …;
+    observation: law of γ_1, γ_2, …
+
+    Before G is applied: G (n, g) and its noise's covariance W (g, g), so that Q = G W G'; None: the identity and Q.
+    Model error: dA (n, n), dG (n, g), dC (p, n), one for each parameter; an empty tuple: zeros.
     """
 
     A: Floats
@@ -41,6 +45,12 @@ class Model:
     P0: Floats
     B: Floats | None = None
     control: Chain = field(default_factory=Chain.lossless)
+    observation: Chain = field(default_factory=Chain.lossless)
+    G: Floats | None = None
+    W: Floats | None = None
+    dA: tuple[Floats, ...] = ()
+    dG: tuple[Floats, ...] = ()
+    dC: tuple[Floats, ...] = ()
 
     @property
     def n(self) -> int:
@@ -118,8 +128,8 @@ class Estimate:
 class Estimator(Protocol):
     """One step = the move from k − 1 to k, then the observation of k.
 
-    It may also have ``check_scenario`` (see registry.check), ``begin_at`` (see registry.create), and ``takes_every_y``
-    (see packets.replay).
+    It may also have ``check_scenario`` (see registry.check), ``begin_at`` (see registry.create), and ``takes_noise``
+    (see ``seen``).
     """
 
     counters: dict[str, int]
@@ -130,6 +140,15 @@ class Estimator(Protocol):
         Raises MissingAck or TooManyHistories where the estimator's definition has no answer.
         """
         ...
+
+
+def seen(estimator: Estimator, arrived: NDArray[Any], received: NDArray[Any]) -> NDArray[Any]:
+    """What an estimator is given as ``arrived``: γ, the lanes in which a packet arrived.
+
+    One that sets ``takes_noise = True`` gets the lanes in which anything was received, be it noise alone: it knows no
+    γ, and takes every y for a measurement.
+    """
+    return received if getattr(estimator, "takes_noise", False) else arrived
 
 
 def newest_ack(acks: tuple[Ack, ...], j: int, counters: dict[str, int]) -> tuple[Mask, Component] | None:

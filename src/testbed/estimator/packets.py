@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from testbed.errors import RunFailed, TestbedError, UsageError
-from testbed.estimator.model import Ack, Estimator, Model
+from testbed.estimator.model import Ack, Estimator, Model, seen
 
 Bit = Annotated[int, Field(ge=0, le=1)]
 
@@ -71,19 +71,19 @@ def replay(
 ) -> Iterator[str]:
     """Lines of OUT.jsonl: k, x_hat, P, up to step ``until``.
 
-    An estimator with ``takes_every_y`` gets a y that carried only noise as one that arrived; the others do not see it.
+    An estimator with ``takes_noise`` gets a y that carried only noise as one that arrived.
     Raises what the estimator raises, and RunFailed for what is not finite.
     """
-    every_y = getattr(estimator, "takes_every_y", False)
     for line in packets:
         if until is not None and line.k > until:
             return
-        arrived = line.y is not None and (every_y or line.gamma != 0)
-        y = line.y if arrived and line.y is not None else [0.0] * model.p
+        received = np.array([line.y is not None])
+        arrived = seen(estimator, received & (line.gamma != 0), received)
+        y = line.y if line.y is not None else [0.0] * model.p
         acks = tuple(Ack(j, np.array([nu]), np.array([1])) for j, nu in line.acks or ()) if use_acks else ()
         try:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                estimate = estimator.step(np.array([line.u or []]), np.array([y]), np.array([arrived]), acks)
+                estimate = estimator.step(np.array([line.u or []]), np.array([y]), arrived, acks)
                 x_hat, P = estimate.x_hat[0], estimate.P[0]
         except TestbedError as error:
             raise type(error)(f"step {line.k}: {error}") from None

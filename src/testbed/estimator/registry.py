@@ -33,6 +33,9 @@ _BUILT_IN = {
     "oe": "testbed.estimator.oe:Oe",
     "oe-lattice": "testbed.estimator.lattice:LatticeOe",
     "pf": "testbed.estimator.pf:Pf",
+    "rse": "testbed.estimator.rse:Rse",
+    "rseio": "testbed.estimator.rseio:Rseio",
+    "rsemm": "testbed.estimator.rsemm:Rsemm",
 }
 GROUP = "testbed.estimators"
 
@@ -77,6 +80,8 @@ def model_of(scenario: Scenario) -> Model:
     """What estimators know of a scenario."""
     system = scenario.system
     g = np.eye(system.n) if system.G is None else np.array(system.G)
+    uncertainty = scenario.uncertainty
+    d_a, d_g, d_c = (uncertainty.dA, uncertainty.dG, uncertainty.dC) if uncertainty is not None else ((), (), ())
     return Model(
         A=np.array(system.A),
         B=None if system.B is None else np.array(system.B),
@@ -86,6 +91,12 @@ def model_of(scenario: Scenario) -> Model:
         x0_mean=np.array(system.x0_mean),
         P0=np.array(system.P0),
         control=chain_of(scenario.links.control.loss),
+        observation=chain_of(scenario.links.observation.loss),
+        G=g,
+        W=np.array(system.Q),
+        dA=tuple(np.array(d) for d in d_a),
+        dG=tuple(np.array(d) for d in d_g),
+        dC=tuple(np.array(d) for d in d_c),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.errors import RunFailed
-from testbed.estimator.model import Ack, Estimator
+from testbed.estimator.model import Ack, Estimator, seen
 from testbed.estimator.registry import create, model_of
 from testbed.numerics.lanes import Floats
 from testbed.scenario import EstimatorSpec, Scenario
@@ -61,6 +61,7 @@ class EstimatorService:
         acks = acks_of(scenario, spec)
         model = model_of(scenario)
         self._name, self._model = name, model
+        self._noise = scenario.links.observation.on_loss == "noise"
         self._until = spec.until or scenario.steps
         self._send = node.sender(node.keys.estimate(name), EstimateMessage)
         self._blocks = {
@@ -101,7 +102,10 @@ class EstimatorService:
         block = self._blocks[lane]
         observation = parts["y"]
         y: Floats = observation["y"] if "y" in observation else np.zeros((block.lanes, self._model.p))
-        estimate = block.estimator.step(parts["u"]["u"], y, observation["mask"], _acks(step, parts.get("ack")))
+        mask = observation["mask"]
+        received = np.ones(block.lanes, dtype=np.uint8) if self._noise else mask
+        arrived = seen(block.estimator, mask, received)
+        estimate = block.estimator.step(parts["u"]["u"], y, arrived, _acks(step, parts.get("ack")))
         x_hat, P = estimate.x_hat, estimate.P
         if not (all_finite(x_hat.ravel()) and all_finite(P.ravel())):
             raise RunFailed(f"the estimate of '{self._name}' left the range of floating-point numbers at step {step}")

@@ -53,6 +53,7 @@ def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[s
     ACKs are those that arrived over the ack link; ``perfect_acks``: those the plant sent.
     """
     steps: dict[int, dict[str, Any]] = {}
+    noisy = False  # whether noise was received in place of what was lost
     acks_topic = "ack/sent" if perfect_acks else "ack/delivered"
     for topic, packet, arrays in read_recording(path):
         row = lane - packet.lane
@@ -61,8 +62,10 @@ def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[s
         if topic == "control/sent":
             steps.setdefault(packet.step + 1, {})["u"] = arrays["u"][row].tolist()
         elif topic == "observation/delivered":
-            arrived = bool(arrays["mask"][row])
-            steps.setdefault(packet.step, {})["y"] = arrays["y"][row].tolist() if arrived else None
+            parts = steps.setdefault(packet.step, {})
+            parts["y"], parts["gamma"] = arrays["y"][row].tolist() if "y" in arrays else None, int(arrays["mask"][row])
+        elif topic == "observation/sent":
+            noisy = noisy or "noise" in arrays
         elif topic == acks_topic and "nu" in arrays and ("mask" not in arrays or arrays["mask"][row]):
             steps.setdefault(packet.step, {})["acks"] = [[packet.step - 1, int(arrays["nu"][row])]]
     if not steps:
@@ -70,7 +73,11 @@ def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[s
     whole = [k for k, parts in steps.items() if "u" in parts and "y" in parts]
     if not whole:
         raise UsageError(f"{path}: holds no whole step of lane {lane}")
-    return [
-        json.dumps({"k": k, "u": steps[k]["u"], "y": steps[k]["y"], "acks": steps[k].get("acks", [])})
-        for k in sorted(whole)
-    ]
+    return [json.dumps({"k": k, **_line(steps[k], noisy=noisy)}) for k in sorted(whole)]
+
+
+def _line(parts: dict[str, Any], *, noisy: bool) -> dict[str, Any]:
+    """What a line says besides k: γ only where a y that was received is noise."""
+    arrived = bool(parts["gamma"])
+    line = {"u": parts["u"], "y": parts["y"] if arrived or noisy else None, "acks": parts.get("acks", [])}
+    return line if arrived or not noisy else {**line, "gamma": 0}

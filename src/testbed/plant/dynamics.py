@@ -1,4 +1,7 @@
-"""The plant of one block of lanes: x_{k+1} = A x_k + ν_k B u_k + G w_k, y_k = C x_k + v_k."""
+"""The plant of one block of lanes: x_{k+1} = A x_k + ν_k B u_k + G w_k, y_k = C x_k + v_k.
+
+With model error A, G and C are A(ε_k), G(ε_k) and C(ε_k); ε_k is that of the step and the lane.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from testbed.numerics.lanes import (
 from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.streams import Stream
 from testbed.numerics.symbols import Shape
-from testbed.scenario import Scenario, System
+from testbed.scenario import Scenario, System, Uncertainty
 
 
 def root(covariance: Floats) -> Floats:
@@ -43,6 +46,8 @@ class Plant:
         system = scenario.system
         self._lanes, self._matrices = lanes, _matrices(scenario.system)
         self._advance = _stepper(self._matrices, lanes)
+        uncertainty = scenario.uncertainty
+        self._derivatives, self._delta = _derivatives(system, uncertainty), 0.0
 
         def stream(purpose: str, width: int) -> Stream:
             return Stream(scenario.seed, "plant", purpose, width=width, lane=lane, lanes=lanes)
@@ -50,13 +55,33 @@ class Plant:
         self._process, self._sensor = stream("process", system.g), stream("sensor", system.p)
         spread = constant_times(constant(root(np.array(system.P0))), stream("initial", system.n).normals(0))
         self.x: Vector = [m + s for m, s in zip(system.x0_mean, spread, strict=True)]
+        self._noise: Vector = []
         self._k = 0
+        if uncertainty is not None and self._derivatives is not None:
+            self._delta = uncertainty.delta
+            self._parameters = stream("uncertainty", uncertainty.parameters)
+            self._epsilon = self._draw(0)
+            self._advance_uncertain = _uncertain_stepper(self._matrices, self._derivatives, lanes)
+
+    def _draw(self, k: int) -> Vector:
+        """ε_k."""
+        return [self._delta * (2.0 * uniform - 1.0) for uniform in self._parameters.uniforms(k)]
+
+    @property
+    def noise(self) -> Floats:
+        """v_k (M, p) of the last observation."""
+        return array_of(constant_times(self._matrices.sensor, self._noise), self._lanes)
 
     def move(self, u: Floats | None, applied: Mask) -> tuple[Floats, Floats]:
         """One step: apply u (M, q) where ``applied``, zero elsewhere. Returns x_{k+1} (M, n) and y_{k+1} (M, p)."""
         control = [0.0] * self._matrices.q if u is None else vector_of(u)
         w, v = self._process.normals(self._k), self._sensor.normals(self._k + 1)
-        self.x, y = self._advance(applied, self.x, control, w, v)
+        if self._derivatives is None:
+            self.x, y = self._advance(applied, self.x, control, w, v)
+        else:
+            before, self._epsilon = self._epsilon, self._draw(self._k + 1)
+            self.x, y = self._advance_uncertain(applied, self.x, control, w, v, before, self._epsilon)
+        self._noise = v
         self._k += 1
         return array_of(self.x, self._lanes), array_of(y, self._lanes)
 
@@ -96,6 +121,67 @@ def _stepper(m: _Matrices, lanes: int) -> Step:
     arguments: tuple[Shape, ...] = (("vector", n), ("vector", m.q), ("vector", len(m.process[0])), ("vector", p))
     results: tuple[Shape, ...] = (("vector", n), ("vector", p))
     return masked_step(partial(_advance, m), arguments, results, lanes)
+
+
+@dataclass(frozen=True)
+class _Derivatives:
+    """By each parameter: of A, of the root through which the process noise enters, and of C."""
+
+    a: tuple[Constant, ...]
+    process: tuple[Constant, ...]
+    c: tuple[Constant, ...]
+
+
+@lru_cache(maxsize=16)
+def _derivatives(system: System, uncertainty: Uncertainty | None) -> _Derivatives | None:
+    """None where the plant is that of the model."""
+    if uncertainty is None or uncertainty.delta == 0.0:
+        return None
+    noise = root(np.array(system.Q))
+    return _Derivatives(
+        tuple(constant(d) for d in uncertainty.dA),
+        tuple(constant(np.array(d) @ noise) for d in uncertainty.dG),
+        tuple(constant(d) for d in uncertainty.dC),
+    )
+
+
+def _shifted(base: Vector, epsilon: Vector, derivatives: tuple[Constant, ...], x: Vector) -> Vector:
+    """base + Σ ε_k D_k x; no derivatives: base."""
+    for e, derivative in zip(epsilon, derivatives, strict=False):
+        moved = constant_times(derivative, x)
+        base = [b + e * m if any(row) else b for b, m, row in zip(base, moved, derivative, strict=True)]
+    return base
+
+
+def _advance_uncertain(
+    m: _Matrices,
+    d: _Derivatives,
+    applied: Mask,
+    x: Vector,
+    u: Vector,
+    w: Vector,
+    v: Vector,
+    before: Vector,
+    after: Vector,
+) -> tuple[Vector, Vector]:
+    """x_{k+1} by A(ε_k) and G(ε_k), y_{k+1} by C(ε_{k+1}); before: ε_k, after: ε_{k+1}."""
+    moved = _shifted(constant_times(m.a, x), before, d.a, x)
+    if m.b is not None and any_of(applied):
+        push = [where(applied, b, 0.0) for b in constant_times(m.b, u)]
+        moved = add(moved, push)
+    x = add(moved, _shifted(constant_times(m.process, w), before, d.process, w))
+    return x, add(_shifted(constant_times(m.c, x), after, d.c, x), constant_times(m.sensor, v))
+
+
+@lru_cache(maxsize=16)
+def _uncertain_stepper(m: _Matrices, d: _Derivatives, lanes: int) -> Step:
+    n, p = len(m.a), len(m.c)
+    parameters = max(len(d.a), len(d.process), len(d.c))
+    noises: tuple[Shape, ...] = (("vector", len(m.process[0])), ("vector", p))
+    drawn: tuple[Shape, ...] = (("vector", parameters), ("vector", parameters))
+    results: tuple[Shape, ...] = (("vector", n), ("vector", p))
+    arguments: tuple[Shape, ...] = (("vector", n), ("vector", m.q), *noises, *drawn)
+    return masked_step(partial(_advance_uncertain, m, d), arguments, results, lanes)
 
 
 def bits(mask: Mask) -> NDArray[np.uint8]:

@@ -14,12 +14,13 @@ from testbed.scenario.inputs import (
     TableInput,
     UniformInput,
 )
-from testbed.scenario.links import AckLink, BernoulliLoss, Link, Links, Loss, MarkovLoss, NoLoss
+from testbed.scenario.links import AckLink, BernoulliLoss, Link, Links, Loss, MarkovLoss, NoLoss, ObservationLink
 from testbed.scenario.load import load_scenario, parse_scenario
 from testbed.scenario.models import Scenario
 from testbed.scenario.schema import scenario_json_schema
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Tls, Transport
+from testbed.scenario.uncertainty import Uncertainty
 from testbed.scenario.write import to_dict, to_toml
 
 __all__ = [
@@ -36,12 +37,14 @@ __all__ = [
     "Loss",
     "MarkovLoss",
     "NoLoss",
+    "ObservationLink",
     "Scenario",
     "SineInput",
     "System",
     "TableInput",
     "Tls",
     "Transport",
+    "Uncertainty",
     "UniformInput",
     "format_duration",
     "load_scenario",

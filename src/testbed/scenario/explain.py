@@ -168,9 +168,10 @@ def _allowed_plain(plain: Any, field: FieldInfo) -> str:
     metadata = [*field.metadata, *_nested_metadata(field.annotation)]
     low = next((entry.ge for entry in metadata if isinstance(entry, annotated_types.Ge)), None)
     high = next((entry.le for entry in metadata if isinstance(entry, annotated_types.Le)), None)
-    limits = f"{low:g} … {high:g}" if plain is float else f"{low} … {high}"
     if low is not None and high is None:
         limits = f"{low} or more"
+    else:
+        limits = f"{low:g} … {high:g}" if plain is float and low is not None else f"{low} … {high}"
     if plain is bool:
         return "true or false"
     if plain is int:

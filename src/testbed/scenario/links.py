@@ -119,6 +119,15 @@ class Link(Part):
     loss: Loss = Field(default_factory=NoLoss, description="Which packets are lost; default none.")
 
 
+class ObservationLink(Link):
+    """The link of the observations."""
+
+    on_loss: Literal["nothing", "noise"] = Field(
+        default="nothing",
+        description="What comes of a lost packet; nothing: only that it is lost; noise: that, and the sensor noise v.",
+    )
+
+
 class AckLink(Part):
     """What the estimators are told about the arrival of control packets."""
 
@@ -143,5 +152,5 @@ class Links(Part):
     """The three links."""
 
     control: Link = Field(default_factory=Link, description="Controller to plant: u.")
-    observation: Link = Field(default_factory=Link, description="Plant to estimators: y.")
+    observation: ObservationLink = Field(default_factory=ObservationLink, description="Plant to estimators: y.")
     ack: AckLink = Field(default_factory=AckLink, description="Plant to estimators: which u were applied.")

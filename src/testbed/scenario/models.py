@@ -11,6 +11,7 @@ from testbed.scenario.inputs import ConstantInput, FeedbackInput, Input, TableIn
 from testbed.scenario.links import Links
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Transport
+from testbed.scenario.uncertainty import Uncertainty
 
 SEED_MAX = 2**63 - 1
 
@@ -24,7 +25,7 @@ def _no_input(data: dict[str, Any]) -> ConstantInput | None:
 class Scenario(Part):
     """Everything that determines a run: the same scenario and seed give the same results."""
 
-    later_keys: ClassVar[tuple[str, ...]] = ("uncertainty", "events")
+    later_keys: ClassVar[tuple[str, ...]] = ("events",)
 
     name: str = Field(
         default="scenario",
@@ -40,12 +41,20 @@ class Scenario(Part):
     bounds: bool = Field(default=True, description="Whether the bounds of the error covariance are computed.")
     clock: Clock = Field(default_factory=Clock, description="How time passes.")
     system: System = Field(description="The system.")
+    uncertainty: Uncertainty | None = Field(default=None, description="Model error of the plant; left out: none.")
     estimators: Annotated[tuple[EstimatorSpec, ...], Field(strict=False)] = Field(
         default=(), description="The estimators, all on the same packets."
     )
     input: Input | None = Field(default_factory=_no_input, description="The input u; default zero. Only with system.B.")
     links: Links = Field(default_factory=Links, description="The links between the parts.")
     transport: Transport = Field(default_factory=Transport, description="How the processes of a run talk.")
+
+    @field_validator("uncertainty")
+    @classmethod
+    def _check_uncertainty(cls, uncertainty: Uncertainty | None, info: ValidationInfo) -> Uncertainty | None:
+        if uncertainty is not None and "system" in info.data:
+            uncertainty.check_sizes(info.data["system"])
+        return uncertainty
 
     @field_validator("estimators")
     @classmethod

@@ -68,7 +68,9 @@ class Packet(Message):
 
 
 _MASK = _bits(
-    "lanes", required=False, text="1 where the packet arrived in the lane; only behind a link; values elsewhere are 0"
+    "lanes",
+    required=False,
+    text="1 where the packet arrived in the lane; only behind a link; values elsewhere are 0, or noise",
 )
 
 
@@ -84,11 +86,17 @@ class Control(Packet):
 
 
 class Observation(Packet):
-    """y_k. Behind the link: with the arrival mask (γ_k); without ``y`` if it arrived in no lane."""
+    """y_k. Behind the link: with the arrival mask (γ_k); without ``y`` if it arrived in no lane.
+
+    On a link with ``on_loss = "noise"`` v_k goes beside y_k, and behind it stands in place of y_k where that is lost.
+    """
 
     type: Literal["observation"] = "observation"
     ARRAYS: ClassVar[dict[str, ArrayRule]] = {
         "y": _floats("lanes", "p", required=False, text="observation y_k"),
+        "noise": _floats(
+            "lanes", "p", required=False, text='sensor noise v_k; only before a link with `on_loss = "noise"`'
+        ),
         "mask": _MASK,
     }
 
