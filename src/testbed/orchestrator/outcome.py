@@ -222,6 +222,8 @@ def _bounds(conductor: Conductor) -> BoundFigures | None:
     reason: str | None = None
     if correlation_factor(chain_of(scenario.links.control.loss)) is None:
         reason = "the control losses never mix, and S holds for independent ones"
+    if scenario.uncertainty is not None:
+        reason = "the bounds are those of the nominal model, and the plant departs from it"
     return BoundFigures.model_validate({**lower, **upper, "upper_reason": reason})
 
 
