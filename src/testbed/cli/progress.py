@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,16 +17,18 @@ class Display:
 
     progress: Progress
     task: TaskID
+    _first: tuple[int, float] | None = None
 
     def update(self, completed: int, steps: int) -> None:
-        self.progress.update(self.task, completed=completed, total=steps, rate=self._rate())
+        now = time.monotonic()
+        if self._first is None:
+            self._first = completed, now
+        done, elapsed_s = completed - self._first[0], now - self._first[1]
+        rate = f"{done / elapsed_s:,.0f} steps/s" if done and elapsed_s > 0.0 else ""
+        self.progress.update(self.task, completed=completed, total=steps, rate=rate)
 
     def say(self, line: str) -> None:
         self.progress.console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-    def _rate(self) -> str:
-        speed = self.progress.tasks[self.task].speed
-        return f"{speed:,.0f} steps/s" if speed else ""
 
 
 @contextmanager
