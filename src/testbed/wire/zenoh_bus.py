@@ -19,6 +19,7 @@ INBOX_MAX = 65536
 
 _AT_ONCE = 256  # events handled before what they gave rise to is sent
 _BUNDLE_MAX = 64  # messages
+_HELD_MAX_S = 0.05  # lazy messages are sent after so long at the latest, where there are others to handle
 _IDLE_S = 0.02  # without work for so long, lazy messages are sent
 _SMALL = 16_384  # bytes; a larger message does not wait
 
@@ -30,6 +31,7 @@ class _Outgoing:
     put: Publish
     waiting: list[bytes]
     lazy: bool
+    since: float = 0.0
 
 
 class ZenohBus:
@@ -131,10 +133,14 @@ class ZenohBus:
         self._session.close()  # type: ignore[no-untyped-call]
 
     def _send(self, *, lazy: bool) -> None:
+        now = time.monotonic()
         for outgoing in self._outbox:
-            if outgoing.waiting and (lazy or not outgoing.lazy):
+            if not outgoing.waiting:
+                outgoing.since = now
+            elif lazy or not outgoing.lazy or now - outgoing.since > _HELD_MAX_S:
                 outgoing.put(bundle(outgoing.waiting))
                 outgoing.waiting.clear()
+                outgoing.since = now
 
     def _patience_s(self, timeout_s: float) -> float:
         held_back = any(outgoing.waiting for outgoing in self._outbox)
