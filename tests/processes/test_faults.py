@@ -32,7 +32,10 @@ pytestmark = pytest.mark.processes
 LONG = 1_000_000
 
 
-def running(tmp_path: Path, *, head: str = "", at_least: int = 400) -> tuple[subprocess.Popen[str], dict[int, str], str]:
+Running = tuple[subprocess.Popen[str], dict[int, str], str]
+
+
+def running(tmp_path: Path, *, head: str = "", at_least: int = 400) -> Running:
     """A run that is past a step, its children, and its key prefix."""
     port = free_port()
     scenario = write_scenario(

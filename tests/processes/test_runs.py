@@ -35,7 +35,12 @@ def test_figures_are_the_same_to_the_bit_over_zenoh_and_in_process_and_for_any_s
 
 def test_every_role_is_a_process_of_its_own(tmp_path: Path) -> None:
     process = start(write(tmp_path, steps=30_000), tmp_path / "out")
-    commands = wait_for(lambda: found if len(found := children_of(process.pid)) == 7 else None)
+
+    def roles() -> dict[int, str] | None:
+        found = {pid: command for pid, command in children_of(process.pid).items() if "--connect" in command}
+        return found if len(found) == 7 else None
+
+    commands = wait_for(roles)
     process.terminate()
     finish(process)
     links = ("--link control", "--link observation")
