@@ -55,7 +55,7 @@ def start(scenario: Path, out: Path, *options: str, **environment: str) -> subpr
     return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env={**os.environ, **environment})
 
 
-def finish(process: subprocess.Popen[str], seconds: float = 60) -> tuple[int, str, str]:
+def finish(process: subprocess.Popen[str], seconds: float = 100) -> tuple[int, str, str]:
     out, err = process.communicate(timeout=seconds)
     return process.returncode, out, err
 
@@ -75,7 +75,7 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def wait_for(what: Callable[[], T | None], seconds: float = 30) -> T:
+def wait_for(what: Callable[[], T | None], seconds: float = 60) -> T:
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         found = what()
@@ -102,11 +102,11 @@ def children_of(pid: int) -> dict[int, str]:
 def alive(pid: int) -> bool:
     try:
         return (Path("/proc") / str(pid) / "stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except FileNotFoundError:
+    except (FileNotFoundError, ProcessLookupError):
         return False
 
 
-def client(port: int, seconds: float = 20) -> zenoh.Session:
+def client(port: int, seconds: float = 60) -> zenoh.Session:
     """A bystander's session to a run's endpoint, once that is there."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')

@@ -103,12 +103,12 @@ def test_roles_leave_when_the_orchestrator_is_killed(tmp_path: Path) -> None:
 
 
 def test_a_role_that_hangs_is_named(tmp_path: Path) -> None:
-    process, children, _ = running(tmp_path, head='deadline = "2 s"')
+    process, children, _ = running(tmp_path, head='deadline = "8 s"')
     (victim,) = [pid for pid, command in children.items() if "--name aoe" in command]
     os.kill(victim, signal.SIGSTOP)
     code, _, err = finish(process)
     assert code == 1
-    assert "no progress for 2 s; waiting for step" in err
+    assert "no progress for 8 s; waiting for step" in err
     assert "estimate of aoe" in err
     assert not any(alive(pid) for pid in children)
 

@@ -92,7 +92,7 @@ def secured(tmp_path: Path, files: dict[str, Path], password_env: str) -> Path:
 user = "lab"
 password_env = "{password_env}"
 users_file = "users.txt"
-deadline = "6 s"
+deadline = "16 s"
 [transport.tls]
 ca = "{files["ca"]}"
 certificate = "{files["server_certificate"]}"
