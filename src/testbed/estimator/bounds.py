@@ -28,14 +28,31 @@ def correlation_factor(control: Chain) -> float | None:
     return (1.0 + r) / (1.0 - r) if r < 1.0 else None
 
 
+class CovarianceBound:
+    """P_{k+1} = φ(A P_k A' + noise, γ_{k+1}) from P_0 in every lane: Pᴬ with noise Q, S with Q + ¼U."""
+
+    def __init__(self, model: Model, noise: Floats, lanes: int) -> None:
+        _, self._p = model.prior(lanes)
+        self._advance = _stepper(model, constant(noise), lanes)
+
+    def step(self, arrived: NDArray[Any]) -> Matrix:
+        """The bound after the observations ``arrived`` (M,) of the next step."""
+        (self._p,) = self._advance(mask_of(arrived), self._p)
+        return self._p
+
+
+def upper_bound(model: Model, U: Floats, lanes: int) -> CovarianceBound:
+    """S for an input with B u_k u_k' B' ≤ U for all k."""
+    return CovarianceBound(model, model.Q + 0.25 * U, lanes)
+
+
 class Bounds:
     """Lower: the ACK covariance Pᴬ. Upper: S, for an input with B u_k u_k' B' ≤ U for all k; none without U."""
 
     def __init__(self, model: Model, U: Floats | None, lanes: int) -> None:
-        self._model, self._lanes = model, lanes
-        _, self._lower = model.prior(lanes)
-        self._upper: Matrix | None = self._lower if U is not None else None
-        self._upper_noise = constant(model.Q if U is None else model.Q + 0.25 * U)
+        self._lanes = lanes
+        self._lower = CovarianceBound(model, model.Q, lanes)
+        self._upper = None if U is None else upper_bound(model, U, lanes)
 
     def step(self, arrived: NDArray[Any]) -> tuple[Floats, Floats | None]:
         """Pᴬ_k and S_k, each (M, n, n), after the observations ``arrived`` (M,) of step k."""
@@ -43,15 +60,8 @@ class Bounds:
         return matrices_of(lower, self._lanes), None if upper is None else matrices_of(upper, self._lanes)
 
     def components(self, arrived: NDArray[Any]) -> tuple[Matrix, Matrix | None]:
-        model, gamma = self._model, mask_of(arrived)
-        self._lower = self._next(self._lower, model.noise, gamma)
-        if self._upper is not None:
-            self._upper = self._next(self._upper, self._upper_noise, gamma)
-        return self._lower, self._upper
-
-    def _next(self, P: Matrix, noise: Constant, gamma: Mask) -> Matrix:
-        (advanced,) = _stepper(self._model, noise, self._lanes)(gamma, P)
-        return advanced  # type: ignore[no-any-return]
+        """The same as components."""
+        return self._lower.step(arrived), None if self._upper is None else self._upper.step(arrived)
 
 
 def _advance(model: Model, noise: Constant, gamma: Mask, P: Matrix) -> tuple[Matrix]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.errors import RunFailed
-from testbed.estimator.bounds import Bounds, correlation_factor
+from testbed.estimator.bounds import Bounds, correlation_factor, upper_bound
 from testbed.estimator.registry import model_of
 from testbed.numerics.lanes import Component, trace
 from testbed.plant.inputs import control_bound
@@ -28,7 +28,7 @@ class BoundsService:
         factor = correlation_factor(model.control)
         self._blocks = {lane: Bounds(model, bound, lanes) for lane, lanes in setup.blocks}
         self._correlated = {
-            lane: Bounds(model, factor * bound, lanes)
+            lane: upper_bound(model, factor * bound, lanes)
             for lane, lanes in setup.blocks
             if bound is not None and factor is not None and factor > 1.0
         }
@@ -42,9 +42,8 @@ class BoundsService:
         if upper is not None:
             traces["trace_upper"] = _lanes(trace(upper), packet.lanes)
         if packet.lane in self._correlated:
-            _, correlated = self._correlated[packet.lane].components(arrays["mask"])
-            if correlated is not None:
-                traces["trace_upper_correlated"] = _lanes(trace(correlated), packet.lanes)
+            correlated = self._correlated[packet.lane].step(arrays["mask"])
+            traces["trace_upper_correlated"] = _lanes(trace(correlated), packet.lanes)
         if not all(all_finite(values) for values in traces.values()):
             raise RunFailed(f"the bounds left the range of floating-point numbers at step {packet.step}")
         self._send(packet.step, packet.lane, packet.lanes, traces)

@@ -58,7 +58,6 @@ class _Lane:
     dropped: float = 0.0
     moment: float = 0.0
     """D and M, the dropped mass and its second moment about the mean, in units in which what is kept has mass 1."""
-    regrids: int = 0
 
 
 class LatticeOe:
@@ -127,7 +126,7 @@ class LatticeOe:
         for bit, s in enumerate(lane.sets):
             arrival = chain.start if first else float(chain.recovery)
             if self._split_by_bit and not first:
-                arrival = 1.0 - chain.failure if self._bit_of(lane, bit) else chain.recovery
+                arrival = 1.0 - chain.failure if bit else chain.recovery
             moved = s.means @ model.A.T
             for fate, share in ((0, 1.0 - arrival), (1, arrival)):
                 if share > 0.0 and nu in (None, fate):
@@ -139,9 +138,6 @@ class LatticeOe:
             lane.sets = [_joined(b) if b else _Set(np.zeros((0, model.n)), np.zeros(0)) for b in branches]
         else:
             lane.sets = [_joined([s for b in branches for s in b])]
-
-    def _bit_of(self, lane: _Lane, position: int) -> int:
-        return position if len(lane.sets) == 2 else 0
 
     def _update(self, lane: _Lane, y: Floats) -> float:
         """Bayes' rule; weights are multiplied by likelihoods relative to their peak, which is returned (its bound)."""
@@ -177,7 +173,6 @@ class LatticeOe:
         model, h = self._model, self._spacing
         factor = np.linalg.cholesky(lane.covariance)
         reach = REACH * math.sqrt(SPLIT)
-        lane.regrids += 1
         for i, s in enumerate(lane.sets):
             if not len(s.weights):
                 continue

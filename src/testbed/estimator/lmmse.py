@@ -8,22 +8,17 @@ from typing import Any
 from numpy.typing import NDArray
 
 from testbed.errors import UsageError
-from testbed.estimator.model import Ack, Estimate, Model, newest_ack
-from testbed.estimator.riccati import Gain, phi, predict
+from testbed.estimator.model import Ack, Estimate, Model, expected_nu
+from testbed.estimator.riccati import Gain, phi, predict_with_mean_control
 from testbed.numerics.lanes import (
     Component,
     Floats,
     Mask,
     Matrix,
     Vector,
-    add,
-    add_outer,
     any_of,
-    constant_times,
     mask_of,
-    scale,
     vector_of,
-    where,
     where_vector,
 )
 from testbed.numerics.stepping import Step, masked_step
@@ -52,25 +47,22 @@ class Lmmse:
         """Older ACKs than that of ν_{k−1} cannot be used and are counted."""
         gamma = mask_of(arrived)
         self._k += 1
-        self._x, self._p = self._advance(gamma, self._x, self._p, self._rate(acks), vector_of(u), vector_of(y))
+        self._x, self._p = self._advance(
+            gamma,
+            self._x,
+            self._p,
+            expected_nu(self._model, acks, self._k - 1, self.counters),
+            vector_of(u),
+            vector_of(y),
+        )
         return Estimate(self._x, self._p, self._lanes)
-
-    def _rate(self, acks: tuple[Ack, ...]) -> Component:
-        ack = newest_ack(acks, self._k - 1, self.counters)
-        rate = self._model.control.start
-        return rate if ack is None else where(ack[0], ack[1], rate)
 
 
 def _advance(
     model: Model, gamma: Mask, x: Vector, P: Matrix, rate: Component, u: Vector, y: Vector
 ) -> tuple[Vector, Matrix]:
     """One step from x̂ and P, with P(ν = 1) = rate."""
-    mean = constant_times(model.a, x)
-    covariance = predict(model.a, P, model.noise)
-    if model.q:
-        push = model.control_effect(u)
-        mean = add(mean, scale(rate, push))
-        covariance = add_outer(covariance, rate * (1.0 - rate), push)
+    mean, covariance = predict_with_mean_control(model, x, P, rate, u)
     gain = Gain(covariance, model.c, model.sensor_noise)
     updated = where_vector(gamma, gain.correct(mean, y), mean) if any_of(gamma) else mean
     return updated, phi(covariance, gain, gamma)

@@ -23,6 +23,7 @@ from testbed.numerics.lanes import (
     full_matrix,
     full_vector,
     matrices_of,
+    where,
 )
 
 
@@ -149,6 +150,13 @@ def seen(estimator: Estimator, arrived: NDArray[Any], received: NDArray[Any]) ->
     γ, and takes every y for a measurement.
     """
     return received if getattr(estimator, "takes_noise", False) else arrived
+
+
+def expected_nu(model: Model, acks: tuple[Ack, ...], j: int, counters: dict[str, int]) -> Component:
+    """E[ν_j] under i.i.d. control losses: the arrival rate, or ν_j itself where an ACK of it came in time."""
+    ack = newest_ack(acks, j, counters)
+    rate = model.control.start
+    return rate if ack is None else where(ack[0], ack[1], rate)
 
 
 def newest_ack(acks: tuple[Ack, ...], j: int, counters: dict[str, int]) -> tuple[Mask, Component] | None:

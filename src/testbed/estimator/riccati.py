@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+from testbed.estimator.model import Model
 from testbed.numerics.lanes import (
     Cholesky,
     Component,
@@ -12,13 +13,16 @@ from testbed.numerics.lanes import (
     Mask,
     Matrix,
     Vector,
+    add,
     add_constant,
+    add_outer,
     any_of,
     constant_dot,
     constant_sandwich,
     constant_times,
     constant_times_matrix,
     dot,
+    scale,
     subtract,
     symmetric,
     times,
@@ -97,3 +101,15 @@ def log_odds(gain: Gain, shift: Vector, innovation: Vector) -> Component:
     g = constant_times(gain.C, shift)
     half = gain.innovation.half_solve(g)
     return dot(half, gain.innovation.half_solve(innovation)) - 0.5 * dot(half, half)
+
+
+def predict_with_mean_control(model: Model, x: Vector, P: Matrix, rate: Component, u: Vector) -> tuple[Vector, Matrix]:
+    """Mean and covariance of the next state where ν is 1 with probability ``rate`` and only its moments are used.
+
+    A x + rate B u, and A P A' + Q + rate (1 − rate) B u u' B' (F eq. 24).
+    """
+    mean, covariance = constant_times(model.a, x), predict(model.a, P, model.noise)
+    if not model.q:
+        return mean, covariance
+    push = model.control_effect(u)
+    return add(mean, scale(rate, push)), add_outer(covariance, rate * (1.0 - rate), push)

@@ -120,9 +120,7 @@ class Collector:
 
     def _estimated(self, record: _Step) -> bool:
         """Whether all estimates of a step have come; where no estimator runs any more, everything else."""
-        return not record.gate and (
-            not record.outstanding or any(k >= self.estimated + 1 for k in self._until.values())
-        )
+        return not record.gate and (not record.outstanding or self.estimated < self._last_estimate)
 
 
 def _component(array: NDArray[np.float64]) -> Component:
