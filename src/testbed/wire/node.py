@@ -88,22 +88,25 @@ class Node:
 
         def receive(_: str, payload: bytes) -> None:
             nonlocal expected
-            try:
-                header, arrays = decoder.decode(payload)
-                if header.source != source:
-                    raise Rejected("source", f"from {header.source}, expected {source}")
-                if header.seq != expected:
-                    raise Rejected("sequence", f"number {header.seq}, expected {expected}")
-                if needs and not arrays.keys() >= required:
-                    raise Rejected("arrays", f"lacks one of {', '.join(needs)}")
-                if isinstance(header, Packet):
-                    turns.check(header)
-            except Rejected as refusal:
-                self.rejected[refusal.reason] += 1
-                return
-            expected += 1
-            self.payload = payload
-            handler(header, arrays)
+            for message, outcome in decoder.read(payload):
+                try:
+                    if isinstance(outcome, Rejected):
+                        raise outcome
+                    header, arrays = outcome
+                    if header.source != source:
+                        raise Rejected("source", f"from {header.source}, expected {source}")
+                    if header.seq != expected:
+                        raise Rejected("sequence", f"number {header.seq}, expected {expected}")
+                    if needs and not arrays.keys() >= required:
+                        raise Rejected("arrays", f"lacks one of {', '.join(needs)}")
+                    if isinstance(header, Packet):
+                        turns.check(header)
+                except Rejected as refusal:
+                    self.rejected[refusal.reason] += 1
+                    continue
+                expected += 1
+                self.payload = message
+                handler(header, arrays)
 
         self.bus.subscribe(key, receive)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import zenoh
 
-from testbed.wire.bundle import bundle, unbundle
+from testbed.wire.bundle import bundle
 from testbed.wire.bus import Answer, BusError, Handler, PresenceHandler, Publish
 
 INBOX_MAX = 65536
@@ -97,9 +97,7 @@ class ZenohBus:
 
     def subscribe(self, key: str, handler: Handler) -> None:
         def handle(sample: Any) -> None:
-            name = str(sample.key_expr) if "*" in key else key
-            for message in unbundle(sample.payload.to_bytes()):
-                handler(name, message)
+            handler(str(sample.key_expr) if "*" in key else key, sample.payload.to_bytes())
 
         self._declared.append(self._session.declare_subscriber(key, self._into_inbox(handle)))
 
