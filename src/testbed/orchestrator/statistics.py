@@ -9,13 +9,11 @@ from functools import lru_cache
 import numpy as np
 
 from testbed.numerics.lanes import Cholesky, Component, Matrix, Vector, dot, many_lanes, one_lane, subtract, trace
-from testbed.numerics.moments import LaneMoments
+from testbed.numerics.moments import LaneMoments, Result
 from testbed.numerics.symbols import Shape
 
 ERROR_FIGURES = ("trace_P", "squared_error", "nees", "excess")
 Figures = dict[str, Component]
-Result = tuple[int, float | None, float | None]
-"""Number of values, mean and standard error."""
 
 
 def error_figures(x: Vector, x_hat: Vector, P: Matrix) -> Figures:
@@ -63,10 +61,7 @@ class Series:
     def close(self, step: int) -> None:
         """The next step is complete: keep its figures and forget the sums."""
         figures = self._open.pop(step, None)
-        if isinstance(figures, LaneMoments):
-            self._closed.append([figures.result(i) for i in range(len(self.names))])
-        else:
-            self._closed.append(figures)
+        self._closed.append(figures.results() if isinstance(figures, LaneMoments) else figures)
 
     @property
     def mean(self) -> dict[str, list[float | None]]:

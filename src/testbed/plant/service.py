@@ -35,7 +35,7 @@ class PlantService:
         lane, lanes, step = packet.lane, packet.lanes, packet.step + 1
         applied = mask_of(arrays["mask"])
         x, y = self._plants[lane].move(arrays.get("u"), applied)
-        if not (all_finite(x.ravel()) and all_finite(y.ravel())):
+        if not (all_finite(x) and all_finite(y)):
             raise RunFailed(f"the state left the range of floating-point numbers at step {step}")
         nu = bits(applied)
         if self._ack is not None:

@@ -340,13 +340,14 @@ class Decoder(Generic[M]):
 
 
 def all_finite(x: NDArray[np.float64]) -> bool:
-    """Whether every entry of a flat array is finite, reading each once in the common case.
+    """Whether every entry of an array is finite, reading each once in the common case.
 
     The product of the two halves is finite only if every factor is; if it is not, it may be an overflow: look closely.
     vdot, unlike dot, does not warn of that.
     """
+    x = x.reshape(-1)
     if len(x) <= _FEW:
-        return all(map(math.isfinite, x.tolist()))
+        return math.isfinite(sum(x.tolist())) or bool(np.isfinite(x).all())
     half = len(x) // 2
     if len(x) > 1 and math.isfinite(np.vdot(x[:half], x[half : 2 * half])):
         return len(x) % 2 == 0 or math.isfinite(x[-1])
