@@ -332,7 +332,7 @@ def topic(key: str) -> str:
 
 
 def step_of(payload: bytes) -> int:
-    match = re.search(rb'"step":(\d+)', payload)
+    match = re.search(rb'"step": *(\d+)', payload)
     assert match is not None
     return int(match[1])
 

@@ -68,8 +68,8 @@ class LinkService:
     def _pass_on(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         lane = packet.lane
         arrived = self._losses[lane].next(packet.step - packet.FIRST_STEP)
-        self._counts.count(lane, arrived)
         self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
+        self._counts.count(lane, arrived)
 
     def _content_of(self, arrays: dict[str, NDArray[Any]], arrived: Mask) -> dict[str, NDArray[Any]]:
         if self._instead is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.numerics.lanes import Component, Matrix, Vector, matrix_of, vector_of
-from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures
+from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures, prepare
 from testbed.wire.setup import Setup
 
 Arrays = dict[str, NDArray[Any]]
@@ -38,7 +38,7 @@ class Collector:
     """
 
     def __init__(self, setup: Setup) -> None:
-        scenario = setup.scenario
+        self._setup, scenario = setup, setup.scenario
         self._blocks = [lane for lane, _ in setup.blocks]
         self._until = {spec.name: spec.until or scenario.steps for spec in scenario.estimators}
         self._last_estimate = max(self._until.values(), default=0)
@@ -57,6 +57,11 @@ class Collector:
         self._ends = sorted({*self._until.values(), scenario.steps})
         self._parts = [self._parts_at(end) for end in self._ends]
         self._steps: dict[int, _Step] = {}
+
+    def prepare(self) -> None:
+        """What would hold up the first step: make it now."""
+        for lanes in {lanes for _, lanes in self._setup.blocks}:
+            prepare(self._setup.sizes.n, lanes)
 
     @property
     def finished(self) -> bool:

@@ -93,6 +93,7 @@ class Run:
                         self._say(f"start {role.name} by hand: {shlex.join(self._by_hand(role, endpoint))}")
                     else:
                         supervisor.start(role, endpoint, self._setup.run, transport)
+                conductor.collector.prepare()
                 with _settled_memory():
                     self._drive(conductor, bus, supervisor, patient=bool(external))
             except KeyboardInterrupt:

@@ -23,6 +23,11 @@ def error_figures(x: Vector, x_hat: Vector, P: Matrix) -> Figures:
     return dict(zip(ERROR_FIGURES, compute(x, x_hat, P), strict=True))
 
 
+def prepare(n: int, lanes: int) -> None:
+    """Make the code that ``error_figures`` needs for blocks of that many lanes, which may take a second."""
+    _compute(n, lanes)
+
+
 def _figures(x: Vector, x_hat: Vector, P: Matrix) -> tuple[Component, ...]:
     error = subtract(x, x_hat)
     squared, spread = dot(error, error), trace(P)
