@@ -147,7 +147,7 @@ def test_each_rseio_of_the_scenario_has_its_mu() -> None:
     assert [(entry["name"], entry["mu"]) for entry in found] == [("a", 0.5), ("rseio", 0.8)]
     assert found[0]["window"] != found[1]["window"]
     wrong = parse_scenario({**R2, "estimators": [{"name": "rseio", "mu": 2.0}]})
-    with pytest.raises(UsageError, match="mu: got 2"):
+    with pytest.raises(UsageError, match=r"estimators\.rseio: .*mu: got 2"):
         analyze(wrong)
     assert analyze(parse_scenario({"system": R2["system"]}))["robust"] is None
 

@@ -170,7 +170,11 @@ def test_any_scenario_gives_json(seed: int, n: int, p: int, scale: float, recove
     A = rng.integers(-2, 3, (n, n)) * scale
     system = {"A": A.tolist(), "C": rng.integers(-1, 2, (p, n)).tolist()}
     system |= {"Q": np.diag(rng.integers(0, 2, n)).tolist(), "R": np.eye(p).tolist()}
-    found = figures(system, markov(recovery, failure))
+    rest: dict[str, Any] = {}
+    if seed % 3 == 0:
+        rest["uncertainty"] = {"dA": (rng.integers(-1, 2, (2, n, n)) * scale).tolist(), "delta": 1.0}
+    found = figures(system, markov(recovery, failure), **rest)
+    assert (found["robust"] is None) == (not rest)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     order = found["moments"]["order"]
     if found["observation"]["stable"] and order is not None:

@@ -82,9 +82,9 @@ class Homography:
         derivative of that map has the norm max_i p/((p+1)(1 + v_i (p+1))) at P = p I and no larger one at any other P
         with least v; the maximum over p is c = (√v + √(1+v))^{-2} = exp(−2 arsinh √v), v the least eigenvalue.
 
-        1/v is the largest x'M'E^{-1}M x / x'G x, which holds for singular M too. A singular G, to ``TOLERANCE`` times its
-        norm, gives 1, except where M takes what G does not see to 0, to the same tolerance: f does not depend on it. A
-        singular E gives 1.
+        1/v is the largest x'M'E^{-1}M x / x'G x, which holds for singular M too. A singular G, to ``TOLERANCE`` times
+        its norm, gives 1, except where M takes what G does not see to 0, to the same tolerance: f does not depend on
+        it. A singular E gives 1.
         """
         try:
             if not _definite(self.E):

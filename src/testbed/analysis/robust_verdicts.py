@@ -18,6 +18,8 @@ from testbed.analysis.robust_windows import (
 )
 from testbed.analysis.structure import TOLERANCE, covariance_root
 from testbed.channel.loss import Chain
+from testbed.errors import UsageError
+from testbed.estimator.model import Model
 from testbed.estimator.registry import create, model_of
 from testbed.estimator.rseio import Rseio
 from testbed.scenario import EstimatorSpec, Scenario
@@ -37,8 +39,7 @@ def robust_figures(scenario: Scenario) -> list[dict[str, Any]] | None:
     specs = [spec for spec in scenario.estimators if spec.kind == _KIND] or [EstimatorSpec(name=_KIND)]
     out = []
     for spec in specs:
-        made = create(_KIND, model, lanes=1, options=spec.options)
-        assert isinstance(made, Rseio)
+        made = _made(spec, model)
         entry: dict[str, Any] = {"name": spec.name, "mu": made.mu}
         try:
             recursion = RobustRecursion.of(model, made.weight)
@@ -46,6 +47,15 @@ def robust_figures(scenario: Scenario) -> list[dict[str, Any]] | None:
         except (np.linalg.LinAlgError, ValueError):
             out.append({**entry, **_NOTHING, **_answer(None, "R Theorem 5", "the numbers overflow")})
     return out
+
+
+def _made(spec: EstimatorSpec, model: Model) -> Rseio:
+    try:
+        made = create(_KIND, model, lanes=1, options=spec.options)
+    except UsageError as error:
+        raise UsageError(f"estimators.{spec.name}: {error}") from None
+    assert isinstance(made, Rseio)
+    return made
 
 
 _NOTHING: dict[str, Any] = {"tolerance": TOLERANCE, "pairs": [], "pattern": None, "window": None, "distance": None}
@@ -70,7 +80,8 @@ def _figures(recursion: RobustRecursion, chain: Chain, P0: Any) -> dict[str, Any
         "rate": window.rate,
     }
     if answer["converges"] is None and window.mean_log < -TOLERANCE and _keeps_definite(recursion) and mixes(chain):
-        reason = f"E log of the contraction over {steps} steps is {window.mean_log:.3g} < 0; {answer['reason']}"
+        value = f"{window.mean_log:.3g} < 0" if window.best > 0.0 else "−∞"
+        reason = f"E log of the contraction over {steps} steps is {value}; {answer['reason']}"
         answer = _answer(True, "R Lemma 3", reason)
     return {**out, "distance": start_distance(recursion, P0), **answer}
 
@@ -148,7 +159,7 @@ def _answer(converges: bool | None, theorem: str, reason: str) -> dict[str, Any]
 
 
 def _pair(of: str, test: PairTest) -> dict[str, Any]:
-    return {"of": of, "pair": test.name, "m": test.m, **_rank(test.rank)}
+    return {"of": of, "pair": test.name, "m": test.m, **_rank(test.rank), "full": test.rank.full}
 
 
 def _rank(rank: Rank) -> dict[str, Any]:
