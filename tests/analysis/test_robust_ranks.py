@@ -81,6 +81,37 @@ def test_the_forms_of_r_for_short_patterns() -> None:
             assert noise.full == definite(phi[:n, n:] @ phi[:n, :n].T)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_the_order_of_a_pattern_is_that_of_time(seed: int) -> None:
+    """Pairs of no RSEIO, with many zeros, so that the ranks depend on the order of losses and arrivals."""
+    rng = np.random.default_rng(seed)
+
+    def sparse(rows: int, columns: int) -> Floats:
+        return np.asarray(rng.normal(size=(rows, columns)) * (rng.random((rows, columns)) < 0.3))
+
+    turn = np.eye(3)[[1, 2, 0]]
+    pairs = Pairs(np.diag([1.0, 2.0, 3.0]) + sparse(3, 3), sparse(3, 1), sparse(1, 3), turn, np.eye(3)[:, :1])
+    arrived = Homography.move(pairs.A1, pairs.G1 @ pairs.G1.T).then(Homography.information(pairs.H1.T @ pairs.H1))
+    lost = Homography.move(pairs.A2, pairs.G2 @ pairs.G2.T)
+    for pattern in itertools.product((False, True), repeat=4):
+        whole = Homography.identity(3)
+        for gamma in pattern:
+            whole = whole.then(arrived if gamma else lost)
+        observation, noise = pattern_ranks(pairs, pattern)
+        assert (observation.full, noise.full) == (definite(whole.G), definite(whole.E)), pattern
+
+
+@pytest.mark.parametrize("model", hard_systems())
+def test_the_noise_of_rseio_reaches_the_same_whatever_is_lost(model: Model) -> None:
+    """A1 = A2 + G2 K and G1, G2 span the same space: so C_n spans [G2, A2 G2, …, A2^{N−1} G2] for every pattern."""
+    pairs = RobustRecursion.of(model, 0.5).pairs
+    inside = np.linalg.pinv(pairs.G2)
+    assert pairs.G2 @ inside @ (pairs.A1 - pairs.A2) == pytest.approx(pairs.A1 - pairs.A2, abs=1e-9)
+    for steps in range(1, 5):
+        ranks = {pattern_ranks(pairs, pattern)[1].rank for pattern in itertools.product((False, True), repeat=steps)}
+        assert len(ranks) == 1
+
+
 def test_one_arrival_is_not_two() -> None:
     """R (14) has the row H1 A1 too for one arrival, and so rank 2; the map does not contract."""
     one = np.eye(2)

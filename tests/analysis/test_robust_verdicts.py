@@ -12,7 +12,9 @@ from scipy.stats import ks_2samp
 
 from analysis.robust_systems import example_of_r
 from testbed.analysis.riemann import riemannian_distance
+from testbed.analysis.robust_ranks import PairTest, Rank
 from testbed.analysis.robust_recursion import RobustRecursion
+from testbed.analysis.robust_verdicts import theorem_5
 from testbed.analysis.robust_windows import contraction_window, possible_patterns, product, shortest_contraction
 from testbed.analysis.verdicts import analyze
 from testbed.channel.loss import Chain
@@ -132,13 +134,16 @@ def test_where_the_conditions_hold(loss: dict[str, Any] | None, system: dict[str
 
 
 def test_a_loss_that_never_comes_proves_nothing() -> None:
-    """Observable only with a loss between: A² with C is, A with C is not; without losses there is no such pattern."""
-    reflection = {"A": [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.5]], "C": [[1.0, 1.0, 0.0]]}
-    system = {**reflection, "Q": np.eye(3).tolist(), "R": [[1.0]]}
-    uncertainty = {"dA": [np.zeros((3, 3)).tolist()], "delta": 1.0}
-    assert said(None, system, uncertainty=uncertainty)["converges"] is None
-    rows = [test["rank"] for test in said(None, system, uncertainty=uncertainty)["pairs"] if test["of"] == "observable"]
-    assert max(rows) < 3
+    """A pair with m = 1 needs a loss between arrivals, and (A2, G2) needs losses alone."""
+    full, short = Rank(2, 2, 0.5), Rank(1, 2, 0.0)
+    seen = [PairTest("(A1 A2^m, H1)", 0, short), PairTest("(A1 A2^m, H1)", 1, full)]
+    driven = [PairTest("(A1 A2^m, G1)", 0, short), PairTest("(A2, G2)", 1, full)]
+    assert theorem_5(seen, driven, ARRIVAL)["converges"] is True
+    assert theorem_5(seen, driven, Chain.lossless())["converges"] is None
+    assert theorem_5(seen[1:] * 2, driven, Chain.lossless())["converges"] is None
+    good = [PairTest("(A1 A2^m, H1)", 0, full)]
+    assert theorem_5(good, driven, Chain.lossless())["converges"] is None
+    assert theorem_5(good, good, Chain.lossless())["converges"] is True
 
 
 def test_each_rseio_of_the_scenario_has_its_mu() -> None:

@@ -77,7 +77,9 @@ def observation_matrix(pairs: Pairs, pattern: Sequence[bool]) -> Floats:
 def noise_matrix(pairs: Pairs, pattern: Sequence[bool]) -> Floats:
     """C_n of R (15): [G_N, A_N G_{N−1}, A_N A_{N−1} G_{N−2}, …], with A1, G1 at an arrival, A2, G2 at a loss, (n, ·).
 
-    It has full row rank if and only if the product of Φ is in R's 𝓗_r (Theorem 4). Scaled as `observation_matrix`.
+    It has full row rank if and only if the product of Φ is in R's 𝓗_r (Theorem 4). Scaled as `observation_matrix`. For
+    the pairs of RSEIO its rank does not depend on the pattern: A1 = A2 + G2 K for some K, and G1, G2 span the same
+    space. So n steps are enough if (A2, G2) is controllable, and no number of steps is if it is not.
     """
     A1, A2, G1, G2 = _scaled(pairs.A1), _scaled(pairs.A2), _scaled(pairs.G1), _scaled(pairs.G2)
     power = np.eye(A1.shape[0])
