@@ -9,25 +9,17 @@ from typing import Any
 import numpy as np
 
 from testbed.analysis.bursts import delivered_run, lost_run
+from testbed.analysis.convergence import Knowledge, convergence, settled
 from testbed.analysis.critical import CriticalArrival, critical_arrival, observed_at_once, recovery_threshold
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.analysis.peak import burst_series, condition_two, failure_limit, growth_factors, scalar_peak_is_stable
+from testbed.analysis.robust_verdicts import robust_figures
 from testbed.analysis.strong import StrongObservability, strong_observability
 from testbed.analysis.structure import Reach, controllability, observability, unstable_eigenvalues
 from testbed.channel.chains import chain_of
 from testbed.channel.loss import Chain
 from testbed.numerics.lanes import Floats
-from testbed.scenario import (
-    ConstantInput,
-    ExponentialInput,
-    FeedbackInput,
-    Input,
-    Links,
-    Loss,
-    Scenario,
-    SineInput,
-    UniformInput,
-)
+from testbed.scenario import FeedbackInput, Input, Links, Loss, Scenario
 
 _AT_THRESHOLD = 1e-9
 """Relative distance below which a rate counts as equal to its threshold; no theorem decides there."""
@@ -47,10 +39,11 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the verdicts need of a system: A (n, n), C (p, n) and what was found out about them."""
+    """What the verdicts need of a system: A (n, n), C (p, n), Q (n, n) and what was found out about them."""
 
     A: Floats
     C: Floats
+    Q: Floats
     radius: float
     controllable: Reach
     observable: Reach
@@ -63,6 +56,7 @@ class Facts:
         return cls(
             A,
             C,
+            Q,
             spectral_radius(A),
             controllability(A, Q),
             observability(A, C),
@@ -139,7 +133,14 @@ def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
         },
         "peak": peak_figures(facts, chain),
         "moments": moment_figures(facts, chain, verdict),
-        "convergence": convergence(facts, chain, scenario.input),
+        "convergence": convergence(
+            facts.observable,
+            facts.controllable,
+            settled(A, facts.C, facts.Q, np.array(scenario.system.R)),
+            Knowledge(chain, chain_of(controlled), scenario.links.ack.mode == "perfect"),
+            scenario.input,
+        ),
+        "robust": robust_figures(scenario),
     }
 
 
@@ -264,45 +265,6 @@ def moment_figures(facts: Facts, chain: Chain, observation: Verdict) -> dict[str
     }
 
 
-def convergence(facts: Facts, observation: Chain, source: Input | None) -> dict[str, Any]:
-    """D Theorem 3: without losses of observations, and with u_k → 0, E[P̄_k] tends to the solution of the ARE.
-
-    ``holds`` is None where the premises are not met or not known: the theorem gives no converse.
-    """
-
-    def answer(holds: bool | None, exponential: bool, reason: str) -> dict[str, Any]:
-        return {"holds": holds, "exponential": exponential, "theorem": "D Theorem 3", "reason": reason}
-
-    if not observation.never_loses:
-        return answer(None, False, "observations are lost")
-    if not (facts.observable.full and facts.controllable.full):
-        return answer(None, False, "(A, C) is not observable, or (A, sqrt Q) not controllable")
-    vanishes, text = vanishing_input(source)
-    if vanishes:
-        return answer(True, True, f"no observation is lost and {text}")
-    return answer(None, False, text)
-
-
-def vanishing_input(source: Input | None) -> tuple[bool | None, str]:
-    """Whether u_k → 0 (each kind that does so does it exponentially), None if unknown, and why, from the kind."""
-    if source is None:
-        return True, "there is no input"
-    if isinstance(source, ConstantInput):
-        zero = _zero(source.value)
-        return zero, "u = 0" if zero else "u is constant and not zero"
-    if isinstance(source, ExponentialInput):
-        zero = _zero(source.offset)
-        return zero, "u tends to 0 exponentially" if zero else "u tends to an offset that is not zero"
-    if isinstance(source, SineInput):
-        zero = _zero(source.offset) and _zero(source.amplitude)
-        return zero, "u = 0" if zero else "u is a sine: it does not tend to 0"
-    if isinstance(source, UniformInput):
-        zero = _zero(source.low) and _zero(source.high)
-        return zero, "u = 0" if zero else "u is drawn afresh at each step: it does not tend to 0"
-    kind = "fed back" if isinstance(source, FeedbackInput) else "a table of finite length"
-    return None, f"u is {kind}: its limit is not known"
-
-
 def _marginal(facts: Facts, chain: Chain) -> Verdict:
     """ρ(A) = 1: nothing grows exponentially."""
     if facts.strongly(chain):
@@ -312,10 +274,6 @@ def _marginal(facts: Facts, chain: Chain) -> Verdict:
 
 def _equal(a: float, b: float) -> bool:
     return math.isclose(a, b, rel_tol=_AT_THRESHOLD)
-
-
-def _zero(value: float | tuple[float, ...]) -> bool:
-    return not np.any(value)
 
 
 def _link(loss: Loss, chain: Chain) -> dict[str, Any]:
