@@ -64,10 +64,12 @@ def run_command(arguments: list[str] | None = None) -> int:
         text = str(error.format_message())  # type: ignore[attr-defined]
         return _refuse(" ".join(text.split()), 2)
     except (KeyboardInterrupt, typer.Abort):
-        return _refuse("interrupted", 130)
+        code = 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    if code == 130:
+        return _refuse("interrupted", 130)
     return code if isinstance(code, int) else 0
 
 
