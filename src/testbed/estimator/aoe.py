@@ -6,12 +6,14 @@ For i.i.d. control losses it is the same estimator as GPB1 and IMM.
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
+from testbed.channel.law import law_of
 from testbed.estimator.model import Ack, Estimate, Model, newest_ack
 from testbed.estimator.riccati import Gain, log_odds, phi, predict
+from testbed.estimator.state import Given, State, last_law, start_of, state_of
 from testbed.numerics.lanes import (
     Component,
     Floats,
@@ -42,6 +44,8 @@ _Weights = tuple[Component, Component]
 class Aoe:
     """One Gaussian and the posterior of the last ν; two hypotheses a step, merged by their moments."""
 
+    STATE_VERSION: ClassVar[int] = 1
+
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
         self._advance = _stepper(model, lanes)
@@ -58,6 +62,25 @@ class Aoe:
         self._x, self._p, *posterior = self._advance(gamma, self._x, self._p, *weights, vector_of(u), vector_of(y))
         self._posterior = posterior[0], posterior[1]
         return Estimate(self._x, self._p, self._lanes)
+
+    def state(self) -> State:
+        """Without ``lost`` and ``delivered``, the posterior of the last ν, before the first step."""
+        posterior = {} if self._posterior is None else dict(zip(("lost", "delivered"), self._posterior, strict=True))
+        return state_of(self._k, self._lanes, {"x": self._x, "P": self._p, **posterior})
+
+    def set_state(self, state: State) -> None:
+        given = Given(state, self._lanes, self._model.n)
+        x, p = given.vector("x"), given.matrix("P")
+        posterior = (given.component("lost"), given.component("delivered")) if given.step else None
+        given.end()
+        self._k, self._x, self._p, self._posterior = given.step, x, p, posterior
+
+    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        self._x, self._p = start_of(step, x_hat, P, self._lanes, self._model.n)
+        self._k, self._posterior = step, None
+        if step:
+            lost, delivered = last_law(law_of(self._model.control), step)
+            self._posterior = full(lost, self._lanes), full(delivered, self._lanes)
 
     def _prior_weights(self, acks: tuple[Ack, ...]) -> _Weights:
         """P(ν_{k−1} = 0) and P(ν_{k−1} = 1) before y_k, with the ACK of it if one came."""

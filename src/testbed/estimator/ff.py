@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
 from testbed.errors import UsageError
 from testbed.estimator.model import Ack, Estimate, Model, expected_nu
 from testbed.estimator.riccati import Gain, phi, predict, predict_with_mean_control
+from testbed.estimator.state import Given, State, start_of, state_of
 from testbed.numerics.lanes import (
     Component,
     Floats,
@@ -32,6 +33,8 @@ class Ff:
     An ACK of ν_{k−1} in time replaces the mean ν̄ of that packet by ν itself, so that with every ACK it is KFIO.
     """
 
+    STATE_VERSION: ClassVar[int] = 1
+
     def __init__(self, model: Model, lanes: int) -> None:
         if not model.control.independent:
             raise UsageError("estimator 'ff' holds for i.i.d. control losses only; for Markov losses use 'aoe' or 'oe'")
@@ -49,6 +52,20 @@ class Ff:
         given = expected_nu(self._model, acks, self._k - 1, self.counters), vector_of(u), vector_of(y)
         self._x, self._p, self._ack_p = self._advance(gamma, self._x, self._p, self._ack_p, *given)
         return Estimate(self._x, self._p, self._lanes)
+
+    def state(self) -> State:
+        return state_of(self._k, self._lanes, {"x": self._x, "P": self._p, "ack_P": self._ack_p})
+
+    def set_state(self, state: State) -> None:
+        given = Given(state, self._lanes, self._model.n)
+        x, p, ack_p = given.vector("x"), given.matrix("P"), given.matrix("ack_P")
+        given.end()
+        self._k, self._x, self._p, self._ack_p = given.step, x, p, ack_p
+
+    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        """Pᴬ, from which the gain comes, begins at P as well: it is what an ACK filter that starts there has."""
+        self._x, self._p = start_of(step, x_hat, P, self._lanes, self._model.n)
+        self._k, self._ack_p = step, self._p
 
 
 def _advance(

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from testbed.estimator.mixtures import IMPOSSIBLE, merged, share, start_scores, transition_scores
+from testbed.channel.law import law_of
+from testbed.estimator.mixtures import IMPOSSIBLE, merged, score_of, share, start_scores, transition_scores
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.riccati import Gain, log_odds, phi, predict
+from testbed.estimator.state import Given, State, last_law, start_of
 from testbed.numerics.kernels import LANES_MIN
 from testbed.numerics.lanes import (
     Component,
@@ -47,13 +49,15 @@ class Gpb:
     fates of the last packets, the newest in the highest bit.
     """
 
+    STATE_VERSION: ClassVar[int] = 1
+
     def __init__(self, model: Model, lanes: int, order: Annotated[int, Ge(0), Le(MAX_ORDER)] = 2) -> None:
         self._model, self._lanes, self._order = model, lanes, order
         self._x: Vector = [np.full(lanes, float(v)) for v in model.x0_mean]
         self._p = symmetric(model.n, lambda i, j: np.full(lanes, float(model.P0[i, j])))
         self._score: Floats = np.zeros(lanes)
         self._bits = 0  # told apart
-        self._posterior: tuple[Floats, Floats] | None = None  # scores of the last ν, for order 0
+        self._posterior: tuple[Floats, Floats] | None = None  # scores of the last ν while no bit is told apart
         self._k = 0
         self.counters: dict[str, int] = {}
 
@@ -64,6 +68,7 @@ class Gpb:
         for ack in acks:
             self._learn(ack)
         priors = self._priors(acks)
+        self._posterior = None
         size = len(self._score)
         shift = model.control_effect(_repeated(u, size)) if model.q else [np.zeros(size)] * model.n
         mask = np.tile(np.asarray(arrived, dtype=np.bool_), size // self._lanes)
@@ -83,6 +88,37 @@ class Gpb:
         if self._bits > self._order:
             self._forget()
         return estimate
+
+    def state(self) -> State:
+        """x (n, S), P (n, n, S), score (S,), S = 2^bits · M; the scores of the last ν where no bit is told apart."""
+        posterior = {} if self._posterior is None else dict(zip(("lost", "delivered"), self._posterior, strict=True))
+        arrays = {"x": self._x, "P": self._p, "score": self._score, **posterior}
+        numbers = {"k": self._k, "bits": self._bits}
+        return {name: np.array(value, dtype=np.int64) for name, value in numbers.items()} | {
+            name: np.array(value) for name, value in arrays.items()
+        }
+
+    def set_state(self, state: State) -> None:
+        n, lanes = self._model.n, self._lanes
+        given = Given(state, lanes, n)
+        bits = given.integer("bits", min(given.step, self._order))
+        size = lanes * 2**bits
+        x, p = given.array("x", np.float64, n, size), given.array("P", np.float64, n, n, size)
+        score, posterior = given.array("score", np.float64, size), None
+        if given.step and not bits:
+            posterior = given.array("lost", np.float64, lanes), given.array("delivered", np.float64, lanes)
+        given.end()
+        self._k, self._bits, self._score, self._posterior = given.step, bits, score, posterior
+        self._x, self._p = list(x), symmetric(n, lambda i, j: p[i, j])
+
+    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        n, lanes = self._model.n, self._lanes
+        start_of(step, x_hat, P, lanes, n)
+        self._x, self._p = [x_hat[:, i].copy() for i in range(n)], symmetric(n, lambda i, j: P[:, i, j].copy())
+        self._k, self._bits, self._score, self._posterior = step, 0, np.zeros(lanes), None
+        if step:
+            lost, delivered = (np.full(lanes, score_of(w)) for w in last_law(law_of(self._model.control), step))
+            self._posterior = lost, delivered
 
     def _learn(self, ack: Ack) -> None:
         """Bar the hypotheses that an ACK of an older packet contradicts."""

@@ -6,13 +6,15 @@ For i.i.d. control losses it is the same estimator as AOE and GPB1.
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
-from testbed.estimator.mixtures import IMPOSSIBLE, merged, share, start_scores, transition_scores
+from testbed.channel.law import law_of
+from testbed.estimator.mixtures import IMPOSSIBLE, merged, score_of, share, start_scores, transition_scores
 from testbed.estimator.model import Ack, Estimate, Model, newest_ack
 from testbed.estimator.riccati import Gain, phi, predict
+from testbed.estimator.state import Given, State, last_law, start_of, state_of
 from testbed.numerics.lanes import (
     Component,
     Floats,
@@ -40,6 +42,8 @@ _SURE = (0.0, IMPOSSIBLE)
 class Imm:
     """Two Gaussians with the posterior of the last ν: mixed by the chain, one filter each, weighed by likelihood."""
 
+    STATE_VERSION: ClassVar[int] = 1
+
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
         self._advance = _stepper(model, lanes)
@@ -64,6 +68,27 @@ class Imm:
         x, p, lost, delivered, *self._modes = self._advance(gamma, *self._modes, *given)
         self._delivered = lost, delivered
         return Estimate(x, p, self._lanes)
+
+    def state(self) -> State:
+        """x, P and the score of each mode, and their probabilities."""
+        names = (*(f"{name}{mode}" for mode in (0, 1) for name in ("x", "P", "score")), "lost", "delivered")
+        return state_of(self._k, self._lanes, dict(zip(names, (*self._modes, *self._delivered), strict=True)))
+
+    def set_state(self, state: State) -> None:
+        given = Given(state, self._lanes, self._model.n)
+        modes = []
+        for mode in (0, 1):
+            modes += [given.vector(f"x{mode}"), given.matrix(f"P{mode}"), given.component(f"score{mode}")]
+        delivered = given.component("lost"), given.component("delivered")
+        given.end()
+        self._k, self._modes, self._delivered = given.step, modes, delivered
+
+    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        x, p = start_of(step, x_hat, P, self._lanes, self._model.n)
+        lost, delivered = last_law(law_of(self._model.control), step) if step else (0.0, 0.0)
+        scores = [score_of(lost), score_of(delivered)] if step else list(_SURE)
+        self._modes = [x, p, full(scores[0], self._lanes), x, p, full(scores[1], self._lanes)]
+        self._k, self._delivered = step, (full(lost, self._lanes), full(delivered, self._lanes))
 
     def _barred(self, acks: tuple[Ack, ...]) -> tuple[Component, Component]:
         """What is added to the scores of ν_{k−1} = 0 and 1: an ACK makes one of them impossible."""

@@ -12,6 +12,7 @@ from testbed.errors import UsageError
 from testbed.estimator.errors import MissingAck
 from testbed.estimator.model import Ack, Estimate, Model, newest_ack
 from testbed.estimator.riccati import Gain, phi, predict
+from testbed.estimator.state import Given, State, start_of, state_of
 from testbed.numerics.lanes import (
     Component,
     Floats,
@@ -39,6 +40,7 @@ class Kfio:
     """
 
     KIND: ClassVar[str] = "kfio"
+    STATE_VERSION: ClassVar[int] = 1
 
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
@@ -64,14 +66,27 @@ class Kfio:
     def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
         """Raises MissingAck where ν_{k−1} matters and is not known."""
         model, gamma = self._model, mask_of(arrived)
-        self._k += 1
         push = model.control_effect(vector_of(u)) if model.q else [0.0] * model.n
         nu = self._nu(push, acks)
+        self._k += 1
         self._x, self._p = self._advance(gamma, self._x, self._p, push, nu, vector_of(y))
         return Estimate(self._x, self._p, self._lanes)
 
+    def state(self) -> State:
+        return state_of(self._k, self._lanes, {"x": self._x, "P": self._p})
+
+    def set_state(self, state: State) -> None:
+        given = Given(state, self._lanes, self._model.n)
+        x, p = given.vector("x"), given.matrix("P")
+        given.end()
+        self._k, self._x, self._p = given.step, x, p
+
+    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        self._x, self._p = start_of(step, x_hat, P, self._lanes, self._model.n)
+        self._k = step
+
     def _nu(self, push: Vector, acks: tuple[Ack, ...]) -> Component:
-        ack = newest_ack(acks, self._k - 1, self.counters)
+        ack = newest_ack(acks, self._k, self.counters)
         if self._model.control.never_loses:
             return 1.0
         known, nu = ack if ack is not None else (False, 0.0)
@@ -80,7 +95,7 @@ class Kfio:
         idle = np.all([np.asarray(b) == 0.0 for b in push], axis=0) if push else np.True_
         if not np.all(known | idle):
             raise MissingAck(
-                f"{self.KIND} needs the ACK of control packet {self._k - 1} at step {self._k} and none has come; "
+                f"{self.KIND} needs the ACK of control packet {self._k} at step {self._k + 1} and none has come; "
                 'give it acks = "perfect", or use aoe, ff or oe'
             )
         return nu

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
 from testbed.errors import UsageError
 from testbed.estimator.model import Ack, Estimate, Model, expected_nu
 from testbed.estimator.riccati import Gain, phi, predict_with_mean_control
+from testbed.estimator.state import Given, State, start_of, state_of
 from testbed.numerics.lanes import (
     Component,
     Floats,
@@ -30,6 +31,8 @@ class Lmmse:
 
     An ACK of ν_{k−1} in time replaces the mean ν̄ of that packet by ν itself, so that with every ACK it is KFIO.
     """
+
+    STATE_VERSION: ClassVar[int] = 1
 
     def __init__(self, model: Model, lanes: int) -> None:
         if not model.control.independent:
@@ -56,6 +59,19 @@ class Lmmse:
             vector_of(y),
         )
         return Estimate(self._x, self._p, self._lanes)
+
+    def state(self) -> State:
+        return state_of(self._k, self._lanes, {"x": self._x, "P": self._p})
+
+    def set_state(self, state: State) -> None:
+        given = Given(state, self._lanes, self._model.n)
+        x, p = given.vector("x"), given.matrix("P")
+        given.end()
+        self._k, self._x, self._p = given.step, x, p
+
+    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        self._x, self._p = start_of(step, x_hat, P, self._lanes, self._model.n)
+        self._k = step
 
 
 def _advance(

@@ -31,14 +31,14 @@ Scores = tuple[float, float]
 
 def start_scores(chain: Chain) -> Scores:
     """log P(ν_0)."""
-    return _log(1.0 - chain.start), _log(chain.start)
+    return score_of(1.0 - chain.start), score_of(chain.start)
 
 
 def transition_scores(chain: Chain) -> tuple[Scores, Scores]:
     """log P(ν_k | ν_{k−1}): the row of ν_{k−1} = 0 and that of ν_{k−1} = 1."""
     return (
-        (_log(1.0 - chain.recovery), _log(chain.recovery)),
-        (_log(chain.failure), _log(1.0 - chain.failure)),
+        (score_of(1.0 - chain.recovery), score_of(chain.recovery)),
+        (score_of(chain.failure), score_of(1.0 - chain.failure)),
     )
 
 
@@ -60,5 +60,6 @@ def merged(
     return add(x, scale(b, away)), add_outer(within, a * b, away)
 
 
-def _log(probability: float) -> float:
+def score_of(probability: float) -> float:
+    """Its logarithm, finite."""
     return math.log(probability) if probability > 0.0 else IMPOSSIBLE

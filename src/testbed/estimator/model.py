@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,8 +129,8 @@ class Estimate:
 class Estimator(Protocol):
     """One step = the move from k − 1 to k, then the observation of k.
 
-    It may also have ``check_scenario`` (see registry.check), ``begin_at`` (see registry.create), and ``takes_noise``
-    (see ``seen``).
+    It may also have ``check_scenario`` (see registry.check), ``begin_at`` (see registry.create), ``takes_noise`` (see
+    ``seen``), ``not_claimed`` (see conformance), and what makes it a ``Restartable``.
     """
 
     counters: dict[str, int]
@@ -139,6 +139,35 @@ class Estimator(Protocol):
         """u (M, q) as sent, y (M, p) with any finite value where nothing arrived, arrived (M,).
 
         Raises MissingAck or TooManyHistories where the estimator's definition has no answer.
+        """
+        ...
+
+
+@runtime_checkable
+class Restartable(Protocol):
+    """An estimator that hands over what it knows; ``snapshot`` makes bytes of it.
+
+    State: arrays of float64, uint8 or int64 by name, all finite.
+    """
+
+    STATE_VERSION: int
+    """Raised when the arrays change their meaning."""
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything that the next step depends on, copied."""
+        ...
+
+    def set_state(self, state: dict[str, NDArray[Any]]) -> None:
+        """Go on from the ``state`` of an estimator with the same model, lanes and options.
+
+        Raises UsageError, and changes nothing, where it is not such a state.
+        """
+        ...
+
+    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        """Go on after ``step`` steps from x_hat (M, n) and P (M, n, n) alone.
+
+        The last ν is unknown: the control chain has the law that it has at that step if nothing is known of it.
         """
         ...
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
+from testbed.channel.law import law_of
 from testbed.estimator.mixtures import IMPOSSIBLE
 from testbed.estimator.model import Ack, Estimate, Model
+from testbed.estimator.state import Given, State, last_law, start_of
 from testbed.numerics.lanes import (
     Cholesky,
     Constant,
@@ -42,6 +44,8 @@ class Pf:
     ``seed``, the number of the lane and the step alone.
     """
 
+    STATE_VERSION: ClassVar[int] = 1
+
     def __init__(
         self,
         model: Model,
@@ -52,6 +56,7 @@ class Pf:
         self._model, self._lanes, self._particles = model, lanes, particles
         self._normals = LaneStream(seed, "estimator.pf", "noise")
         self._uniforms = LaneStream(seed, "estimator.pf", "control")
+        self._seed = seed
         self._root = _root(model.Q)
         self._factor = Cholesky([list(row) for row in model.sensor_noise])
         self._first = 0
@@ -65,13 +70,12 @@ class Pf:
 
     def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
         """An ACK of ν_{k−1} is used; older ones come too late and are counted."""
-        if self._clouds is None:
-            self._clouds = [self._start(self._first + lane) for lane in range(self._lanes)]
+        clouds = self._begun()
         self._k += 1
         fates = self._fates(acks)
         n = self._model.n
         x_hat, P = np.empty((self._lanes, n)), np.empty((self._lanes, n, n))
-        for lane, cloud in enumerate(self._clouds):
+        for lane, cloud in enumerate(clouds):
             normals, uniforms = self._draws(self._first + lane)
             self._move(cloud, u[lane], fates[lane], normals, uniforms)
             if arrived[lane]:
@@ -83,11 +87,55 @@ class Pf:
                 _resample(cloud, weights, float(uniforms[-1]))
         return Estimate(vector_of(x_hat), matrix_of(P), self._lanes)
 
-    def _start(self, lane: int) -> _Cloud:
-        normals = self._normals.normals(lane, 0, self._model.n * self._particles)
-        spread = constant_times(_root(self._model.P0), list(normals.reshape(self._model.n, self._particles)))
-        x = [np.full(self._particles, m) + s for m, s in zip(self._model.x0_mean, spread, strict=True)]
-        return _Cloud(x, None, np.zeros(self._particles))
+    def state(self) -> State:
+        """x (M, n, N), nu (M, N) from the first step on, scores (M, N), and ``lane``, the number of the first lane."""
+        clouds = self._begun()
+        out: State = {
+            "k": np.array(self._k, dtype=np.int64),
+            "lane": np.array(self._first, dtype=np.int64),
+            "x": np.array([cloud.x for cloud in clouds]),
+            "scores": np.array([cloud.scores for cloud in clouds]),
+        }
+        if self._k:
+            out["nu"] = np.array([cloud.nu for cloud in clouds], dtype=np.uint8)
+        return out
+
+    def set_state(self, state: State) -> None:
+        lanes, n, particles = self._lanes, self._model.n, self._particles
+        given = Given(state, lanes, n)
+        first = given.integer("lane", 2**31)
+        x = given.array("x", np.float64, lanes, n, particles)
+        scores = given.array("scores", np.float64, lanes, particles)
+        nu = given.array("nu", np.uint8, lanes, particles).astype(np.bool_) if given.step else [None] * lanes
+        given.end()
+        self._k, self._first = given.step, first
+        self._clouds = [_Cloud(list(x[lane]), nu[lane], scores[lane]) for lane in range(lanes)]
+
+    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        """Draws the particles from N(x̂, P), with streams of their own."""
+        start_of(step, x_hat, P, self._lanes, self._model.n)
+        streams = [LaneStream(self._seed, "estimator.pf", f"start.{part}") for part in ("noise", "control")]
+        self._k, self._clouds = step, []
+        for lane in range(self._lanes):
+            cloud = self._cloud(x_hat[lane], P[lane], streams[0], self._first + lane)
+            if step:
+                arrived = last_law(law_of(self._model.control), step)[1]
+                cloud.nu = streams[1].uniforms(self._first + lane, step, self._particles) < arrived
+            self._clouds.append(cloud)
+
+    def _begun(self) -> list[_Cloud]:
+        if self._clouds is None:
+            model, lanes = self._model, range(self._first, self._first + self._lanes)
+            self._clouds = [self._cloud(model.x0_mean, model.P0, self._normals, lane) for lane in lanes]
+        return self._clouds
+
+    def _cloud(self, mean: Floats, covariance: Floats, stream: LaneStream, lane: int) -> _Cloud:
+        """Drawn from N(mean, covariance), with the draws of step k."""
+        n, particles = self._model.n, self._particles
+        normals = stream.normals(lane, self._k, n * particles).reshape(n, particles)
+        spread = constant_times(_root(covariance), list(normals))
+        x = [np.full(particles, m) + s for m, s in zip(mean, spread, strict=True)]
+        return _Cloud(x, None, np.zeros(particles))
 
     def _draws(self, lane: int) -> tuple[Vector, Floats]:
         n, particles = self._model.n, self._particles

@@ -62,6 +62,12 @@ def create(
     return made
 
 
+def kind_of(estimator: Estimator) -> str:
+    """The name of a built-in estimator, MODULE:CLASS of another."""
+    path = f"{type(estimator).__module__}:{type(estimator).__qualname__}"
+    return next((kind for kind, known in _BUILT_IN.items() if known == path), path)
+
+
 def check(spec: EstimatorSpec, model: Model, *, acks: str, scenario: Scenario) -> None:
     """Raises UsageError where an estimator of a scenario cannot be made, or says that it cannot run in it.
 

@@ -1,0 +1,215 @@
+"""Snapshots: what an estimator knows after a step, as arrays and as bytes, so that another object can go on from it.
+
+*Moments* are x̂ and P, from which an estimator of any kind can start. A *full* snapshot has the state besides, with
+which an estimator of the same kind, model and options goes on to the same bits.
+
+Bytes: ``NCSS``, uint32 header length, JSON header, the arrays it lists one after the other (little-endian, C order),
+and the BLAKE2b digest (16 bytes) of all that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from hashlib import blake2b
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from testbed.errors import UsageError
+from testbed.estimator.model import Estimate, Estimator, Restartable
+from testbed.estimator.registry import kind_of
+from testbed.estimator.state import MAX_STEP
+
+MAX_BYTES = 1 << 28
+MAX_HEADER = 1 << 16
+FORMAT = 1
+_MAGIC = b"NCSS"
+_DIGEST = 16
+_STATE, _COUNTER = "state.", "counter."
+_CODES: dict[str, np.dtype[Any]] = {"<f8": np.dtype("<f8"), "<i8": np.dtype("<i8"), "|u1": np.dtype("u1")}
+
+Form = Literal["full", "moments"]
+_Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.-]{0,63}$")]
+_Size = Annotated[int, Field(ge=1, le=2**31)]
+_Shape = Annotated[tuple[Annotated[int, Field(ge=0, le=2**31)], ...], Field(max_length=8)]
+_Entry = tuple[_Name, Literal["<f8", "<i8", "|u1"], _Shape]
+
+
+class _Header(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    v: Literal[1]
+    form: Form
+    kind: Annotated[str, Field(min_length=1, max_length=256)]
+    version: Annotated[int, Field(ge=0, le=2**31)]
+    step: Annotated[int, Field(ge=0, le=MAX_STEP)]
+    lanes: _Size
+    n: _Size
+    arrays: Annotated[tuple[_Entry, ...], Field(max_length=256)]
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """After ``step`` steps of an estimator of ``kind``.
+
+    version: the estimator's STATE_VERSION; arrays: x_hat (lanes, n) and P (lanes, n, n), and in the full form
+    ``state.NAME`` for each array of the state and ``counter.NAME`` for each counter.
+    """
+
+    form: Form
+    kind: str
+    version: int
+    step: int
+    lanes: int
+    n: int
+    arrays: Mapping[str, NDArray[Any]]
+
+    def moments(self) -> Snapshot:
+        """The same without the state: any kind can start from it."""
+        return replace(self, form="moments", arrays={name: self.arrays[name] for name in ("x_hat", "P")})
+
+    def to_bytes(self) -> bytes:
+        """Raises UsageError for a type that has no code, for what is not finite, or for more than MAX_BYTES."""
+        size = sum(array.nbytes for array in self.arrays.values())
+        if size > MAX_BYTES - MAX_HEADER:
+            raise UsageError(f"snapshot of {size} bytes; allowed: {MAX_BYTES - MAX_HEADER}")
+        entries, content = [], []
+        for name, array in self.arrays.items():
+            code = next((code for code, dtype in _CODES.items() if array.dtype == dtype), None)
+            if code is None:
+                raise UsageError(f"snapshot: {name!r} is {array.dtype}; allowed: float64, int64, uint8")
+            if not np.isfinite(array).all():
+                raise UsageError(f"snapshot: {name!r} holds a value that is not finite")
+            entries.append((name, code, array.shape))
+            content.append(np.ascontiguousarray(array, dtype=_CODES[code]).tobytes())
+        try:
+            given = {name: getattr(self, name) for name in ("form", "kind", "version", "step", "lanes", "n")}
+            header = _Header.model_validate({"v": FORMAT, **given, "arrays": tuple(entries)})
+        except ValidationError as error:
+            raise UsageError(f"snapshot: {_first(error)}") from None
+        text = header.model_dump_json().encode()
+        if len(text) > MAX_HEADER:
+            raise UsageError(f"snapshot: header of {len(text)} bytes; allowed: {MAX_HEADER}")
+        body = b"".join([_MAGIC, len(text).to_bytes(4, "little"), text, *content])
+        return body + _digest(body)
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Snapshot:
+        """Raises UsageError for everything that ``to_bytes`` does not write."""
+        if not 8 + _DIGEST <= len(data) <= MAX_BYTES + _DIGEST:
+            raise UsageError(f"snapshot of {len(data)} bytes; allowed: {8 + _DIGEST} … {MAX_BYTES + _DIGEST}")
+        if data[:4] != _MAGIC:
+            raise UsageError("not a snapshot: it does not begin with NCSS")
+        if _digest(data[:-_DIGEST]) != data[-_DIGEST:]:
+            raise UsageError("snapshot: damaged, its digest does not match")
+        length = int.from_bytes(data[4:8], "little")
+        if length > MAX_HEADER or 8 + length + _DIGEST > len(data):
+            raise UsageError(f"snapshot: header of {length} bytes in {len(data)}; allowed: {MAX_HEADER} at most")
+        try:
+            header = _Header.model_validate_json(data[8 : 8 + length])
+        except ValidationError as error:
+            raise UsageError(f"snapshot: {_first(error)}") from None
+        arrays = _arrays(header, data, 8 + length)
+        found = cls(header.form, header.kind, header.version, header.step, header.lanes, header.n, arrays)
+        found._check()
+        return found
+
+    def _check(self) -> None:
+        for name, shape in (("x_hat", (self.lanes, self.n)), ("P", (self.lanes, self.n, self.n))):
+            array = self.arrays.get(name)
+            if array is None:
+                raise UsageError(f"snapshot: {name!r} is missing")
+            if array.dtype != np.float64 or array.shape != shape:
+                raise UsageError(f"snapshot: {name!r} is {array.dtype} {array.shape}; expected float64 {shape}")
+        for name, array in self.arrays.items():
+            counter = name.startswith(_COUNTER)
+            known = name in ("x_hat", "P") or (self.form == "full" and (counter or name.startswith(_STATE)))
+            if not known or (counter and (array.dtype != np.int64 or array.shape != ())):
+                raise UsageError(f"snapshot: unexpected array {name!r} in the {self.form} form")
+
+
+def take(estimator: Estimator, form: Form, *, step: int, estimate: Estimate) -> Snapshot:
+    """What an estimator knows after ``step`` steps, the last of which gave ``estimate``; copies.
+
+    Raises UsageError for one that has no state to give.
+    """
+    given = _restartable(estimator)
+    lanes, n = estimate.x_hat.shape
+    arrays: dict[str, NDArray[Any]] = {"x_hat": np.array(estimate.x_hat), "P": np.array(estimate.P)}
+    if form == "full":
+        arrays |= {_STATE + name: array for name, array in given.state().items()}
+        arrays |= {_COUNTER + name: np.array(count, dtype=np.int64) for name, count in estimator.counters.items()}
+    return Snapshot(form, kind_of(estimator), given.STATE_VERSION, step, lanes, n, arrays)
+
+
+def restore(snapshot: Snapshot, estimator: Estimator, *, lanes: int, n: int, step: int | None = None) -> None:
+    """Let a fresh estimator go on from a snapshot: of its own kind if that is full, of any kind if it is moments.
+
+    lanes, n: those of the estimator; step: the one that is expected, None for any.
+    Raises UsageError where the snapshot is not for this estimator.
+    """
+    given, kind = _restartable(estimator), kind_of(estimator)
+    for what, expected in (("lanes", lanes), ("n", n), ("step", step)):
+        if expected is not None and getattr(snapshot, what) != expected:
+            raise UsageError(f"snapshot: {what} is {getattr(snapshot, what)}; expected {expected}")
+    if snapshot.form == "moments":
+        given.start_from(snapshot.step, snapshot.arrays["x_hat"], snapshot.arrays["P"])
+        return
+    if snapshot.kind != kind:
+        raise UsageError(f"snapshot: of {snapshot.kind!r}, in full; expected {kind!r}, or the moments of any kind")
+    if snapshot.version != given.STATE_VERSION:
+        raise UsageError(
+            f"snapshot: version {snapshot.version} of the state of {kind!r}; expected {given.STATE_VERSION}, or moments"
+        )
+    state = {name.removeprefix(_STATE): a for name, a in snapshot.arrays.items() if name.startswith(_STATE)}
+    if "k" in state and (state["k"].shape != () or state["k"] != snapshot.step):
+        raise UsageError(f"snapshot: of step {snapshot.step}, and its state is of another")
+    given.set_state(state)
+    estimator.counters.clear()
+    for name, array in snapshot.arrays.items():
+        if name.startswith(_COUNTER):
+            estimator.counters[name.removeprefix(_COUNTER)] = int(array)
+
+
+def _restartable(estimator: Estimator) -> Restartable:
+    if not isinstance(estimator, Restartable):
+        raise UsageError(
+            f"estimator {kind_of(estimator)!r} cannot be snapshotted: "
+            "it lacks one of STATE_VERSION, state, set_state, start_from"
+        )
+    return estimator
+
+
+def _arrays(header: _Header, data: bytes, offset: int) -> dict[str, NDArray[Any]]:
+    out: dict[str, NDArray[Any]] = {}
+    end = len(data) - _DIGEST
+    for name, code, shape in header.arrays:
+        dtype, count = _CODES[code], math.prod(shape)
+        if name in out:
+            raise UsageError(f"snapshot: {name!r} is there twice")
+        if count * dtype.itemsize > end - offset:
+            raise UsageError(f"snapshot: {name!r} {shape} is longer than the {end - offset} bytes that are left")
+        try:
+            array = np.frombuffer(data, dtype, count, offset).reshape(shape)
+        except ValueError as error:
+            raise UsageError(f"snapshot: {name!r} {shape}: {error}") from None
+        if not np.isfinite(array).all():
+            raise UsageError(f"snapshot: {name!r} holds a value that is not finite")
+        out[name] = array
+        offset += array.nbytes
+    if offset != end:
+        raise UsageError(f"snapshot: {end - offset} bytes behind the last array")
+    return out
+
+
+def _digest(body: bytes) -> bytes:
+    return blake2b(body, digest_size=_DIGEST).digest()
+
+
+def _first(error: ValidationError) -> str:
+    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    return " ".join(f"{'.'.join(map(str, first['loc'])) or 'header'}: {first['msg']}".split())

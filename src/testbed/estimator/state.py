@@ -1,0 +1,110 @@
+"""The state of an estimator as named arrays, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from testbed.channel.law import Law
+from testbed.errors import UsageError, did_you_mean
+from testbed.numerics.lanes import (
+    Component,
+    Floats,
+    Matrix,
+    Vector,
+    array_of,
+    matrices_of,
+    matrix_of,
+    symmetric,
+    vector_of,
+)
+
+State: TypeAlias = dict[str, NDArray[Any]]
+"""Arrays of float64, uint8 or int64 by name; ``k``, of shape (), is the number of steps done."""
+
+MAX_STEP = 2**53
+_ROUNDING = 1e-9
+
+
+def state_of(step: int, lanes: int, parts: Mapping[str, Component | Vector | Matrix]) -> State:
+    """Components as (M,), vectors as (M, n), matrices as (M, n, n), all of them copies; and ``k``."""
+    return {"k": np.array(step, dtype=np.int64), **{name: _packed(part, lanes) for name, part in parts.items()}}
+
+
+class Given:
+    """A state that is read. Every wrong name, type or shape is a UsageError; what is read are copies."""
+
+    def __init__(self, state: Mapping[str, NDArray[Any]], lanes: int, n: int) -> None:
+        self._state, self._lanes, self._n = state, lanes, n
+        self._read: set[str] = set()
+        self.step = self.integer("k", MAX_STEP)
+
+    def integer(self, name: str, largest: int) -> int:
+        """A number 0 … largest."""
+        value = int(self.array(name, np.int64))
+        if not 0 <= value <= largest:
+            raise UsageError(f"state: {name!r} is {value}; allowed: 0 … {largest}")
+        return value
+
+    def component(self, name: str) -> Component:
+        array = self.array(name, np.float64, self._lanes)
+        return float(array[0]) if self._lanes == 1 else array
+
+    def vector(self, name: str) -> Vector:
+        return vector_of(self.array(name, np.float64, self._lanes, self._n))
+
+    def matrix(self, name: str) -> Matrix:
+        """A symmetric one; what is above the diagonal counts."""
+        matrix = matrix_of(self.array(name, np.float64, self._lanes, self._n, self._n))
+        return symmetric(self._n, lambda i, j: matrix[i][j])
+
+    def array(self, name: str, dtype: Any, *shape: int) -> NDArray[Any]:
+        self._read.add(name)
+        array = self._state.get(name)
+        expected = f"{np.dtype(dtype)} {shape}"
+        if array is None:
+            raise UsageError(f"state: {name!r} is missing; expected {expected}")
+        if array.dtype != dtype or array.shape != shape:
+            raise UsageError(f"state: {name!r} is {array.dtype} {array.shape}; expected {expected}")
+        if not np.isfinite(array).all():
+            raise UsageError(f"state: {name!r} holds a value that is not finite")
+        return np.array(array)
+
+    def end(self) -> None:
+        """Raises UsageError where the state holds what was not asked for."""
+        for name in self._state:
+            if name not in self._read:
+                raise UsageError(f"state: unknown {name!r}{did_you_mean(name, self._read)}")
+
+
+def start_of(step: int, x_hat: Floats, P: Floats, lanes: int, n: int) -> tuple[Vector, Matrix]:
+    """x̂ (M, n) and P (M, n, n) as components. Raises UsageError where they or the step cannot be a start."""
+    if not 0 <= step <= MAX_STEP:
+        raise UsageError(f"start: step {step}; allowed: 0 … {MAX_STEP}")
+    given = Given({"k": np.array(step, dtype=np.int64), "x_hat": x_hat, "P": P}, lanes, n)
+    mean, covariance = given.vector("x_hat"), given.matrix("P")
+    scale = np.abs(P).max(axis=(1, 2), keepdims=True)
+    unit = P / np.where(scale > 0.0, scale, 1.0)
+    if (np.abs(unit - unit.transpose(0, 2, 1)) > _ROUNDING).any():
+        raise UsageError("start: P is not symmetric")
+    if (np.linalg.eigvalsh(unit) < -_ROUNDING).any():
+        raise UsageError("start: P has a negative eigenvalue")
+    return mean, covariance
+
+
+def last_law(law: Law, step: int) -> Floats:
+    """The law (H,) of the state of packet ``step`` − 1 ≥ 0 of which nothing is known: initial · transition^(step − 1).
+
+    So that of the next packet is initial · transition^step.
+    """
+    weights = law.initial @ np.linalg.matrix_power(law.transition, step - 1)
+    return np.asarray(weights / weights.sum())
+
+
+def _packed(part: Any, lanes: int) -> Floats:
+    if not isinstance(part, list):
+        return np.array(np.broadcast_to(np.asarray(part, dtype=np.float64), lanes))
+    return matrices_of(part, lanes) if isinstance(part[0], list) else array_of(part, lanes)
