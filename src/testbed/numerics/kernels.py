@@ -115,19 +115,26 @@ def _loop(stage: _Stage, types: Mapping[str, str]) -> Callable[..., None]:
     lines += [f"        {name} = i_{name}[i]" for name in stage.inputs]
     lines += [f"        {name} = {expression}" for name, expression in stage.lines]
     lines += [f"        o_{name}[i] = {name}" for name in stage.outputs]
-    inline = numba.njit(inline="always", error_model="numpy")
-    namespace: dict[str, Any] = {
-        "sqrt": math.sqrt,
-        "reciprocal": inline(_reciprocal),
-        "clip": inline(_clip),
-        "where": inline(_where),
-    }
+    namespace = primitives()
     exec("\n".join(lines), namespace)
     floats, bits = (numba.types.Array(t, 1, "C", readonly=True) for t in (numba.float64, numba.boolean))
     signature: list[Any] = [bits if types.get(name) == "mask" else floats for name in stage.inputs]
     signature += [numba.float64[::1]] * len(stage.outputs)
     found: Callable[..., None] = numba.njit(numba.void(*signature), error_model="numpy", nogil=True)(namespace["loop"])
     return found
+
+
+def primitives() -> dict[str, Any]:
+    """The functions of components that are compiled, by name."""
+    import numba
+
+    inline = numba.njit(inline="always", error_model="numpy")
+    return {
+        "sqrt": math.sqrt,
+        "reciprocal": inline(_reciprocal),
+        "clip": inline(_clip),
+        "where": inline(_where),
+    }
 
 
 def _array(value: Any, lanes: int, kind: str) -> Any:
