@@ -11,6 +11,7 @@ from typing import Any
 
 from testbed.numerics.kernels import available, primitives
 from testbed.numerics.lanes import STRAIGHT_MAX, Bools, Floats
+from testbed.numerics.loops import Loop, loops
 from testbed.numerics.symbols import Program, Shape, from_components, size_of, to_components, traced
 
 LANE_STEPS_MIN = 50_000
@@ -58,9 +59,12 @@ def _values(arrays: Arrays, shapes: Sequence[Shape]) -> list[Any]:
 def _compiled(program: Program, state: Sequence[Shape], given: Sequence[Shape]) -> Scan:
     import numba
 
+    computed = {name for name, _ in program.lines}
+    parts = loops(program, [name for name in dict.fromkeys(program.outputs) if name in computed], program.inputs)
     namespace = primitives()
-    exec("\n".join([*_lanes_source(program), *_block_source(program, state, given)]), namespace)
-    namespace["lanes"] = numba.njit(error_model="numpy")(namespace["lanes"])
+    exec("\n".join(_source(program, parts, state, given)), namespace)
+    for i in range(len(parts)):
+        namespace[f"part{i}"] = numba.njit(error_model="numpy")(namespace[f"part{i}"])
     block = numba.njit(error_model="numpy", nogil=True)(namespace["block"])
 
     def run(mask: Bools, start: Arrays, inputs: Arrays, out: Arrays) -> None:
@@ -69,44 +73,34 @@ def _compiled(program: Program, state: Sequence[Shape], given: Sequence[Shape]) 
     return run
 
 
-def _lanes_source(program: Program) -> Iterator[str]:
-    """One step of a row of lanes: ``lanes(inputs that are used, outputs)``."""
-    outputs = [f"o{i}" for i in range(len(program.outputs))]
-    yield f"def lanes({', '.join([f'i_{name}' for name in _used(program)] + outputs)}):"
-    yield "    for i in range(len(o0)):"
-    yield from (f"        {name} = i_{name}[i]" for name in _used(program))
-    yield from (f"        {name} = {expression}" for name, expression in program.lines)
-    yield from (f"        {out}[i] = {value}" for out, value in zip(outputs, program.outputs, strict=True))
-
-
-def _block_source(program: Program, state: Sequence[Shape], given: Sequence[Shape]) -> Iterator[str]:
-    """All steps of all lanes, a tile of lanes after the other: ``block(mask, starts, given, states after)``."""
-    before = [f"before{i}" for i in range(len(state))]
-    inputs = [f"given{i}" for i in range(len(given))]
-    after = [f"after{i}" for i in range(len(state))]
-    begin = _call(program, ["mask[0, lo:hi]", *_rows(before, "", state), *_rows(inputs, "0, ", given)])
-    go_on = _call(program, ["mask[k, lo:hi]", *_rows(after, "k - 1, ", state), *_rows(inputs, "k, ", given)])
+def _source(program: Program, parts: Sequence[Loop], state: Sequence[Shape], given: Sequence[Shape]) -> Iterator[str]:
+    """The loops over lanes, and ``block(mask, states before, given, states after)`` that calls them step by step."""
+    computed = {name for name, _ in program.lines}
+    for i, part in enumerate(parts):
+        yield from part.source(f"part{i}")
+    before, inputs, after = (
+        [f"{name}{i}" for i in range(len(shapes))]
+        for name, shapes in (("before", state), ("given", given), ("after", state))
+    )
     yield f"def block({', '.join(['mask', *before, *inputs, *after])}):"
     yield "    steps, total = mask.shape"
     yield f"    for lo in range(0, total, {TILE}):"
     yield f"        hi = min(lo + {TILE}, total)"
-    yield f"        {', '.join([begin, *_rows(after, '0, ', state)])})"
-    yield "        for k in range(1, steps):"
-    yield f"            {', '.join([go_on, *_rows(after, 'k, ', state)])})"
+    for head, step, last in (
+        ("        k = 0", "        ", _rows(before, "", state)),
+        ("        for k in range(1, steps):", "            ", _rows(after, "k - 1, ", state)),
+    ):
+        yield head
+        here = ["mask[k, lo:hi]", *last, *_rows(inputs, "k, ", given)]
+        outputs = list(zip(program.outputs, _rows(after, "k, ", state), strict=True))
+        rows = {name: row for name, row in reversed(outputs) if name in computed}
+        rows.update(zip(program.inputs, here, strict=True))
+        for i, part in enumerate(parts):
+            yield f"{step}part{i}({', '.join(rows[name] for name in (*part.inputs, *part.outputs))})"
+        yield from (f"{step}{row}[:] = {rows.get(name, name)}" for name, row in outputs if rows.get(name) != row)
 
 
 def _rows(arrays: Sequence[str], step: str, shapes: Sequence[Shape]) -> list[str]:
-    """The rows of a tile at a step, one a component."""
+    """The rows of a tile, one a component."""
     pairs = zip(arrays, shapes, strict=True)
     return [f"{array}[{step}{i}, lo:hi]" for array, shape in pairs for i in range(size_of(shape))]
-
-
-def _call(program: Program, rows: Sequence[str]) -> str:
-    """The beginning of a call of ``lanes``, with the rows of the inputs that are used."""
-    used = set(_used(program))
-    return "lanes(" + ", ".join(row for name, row in zip(program.inputs, rows, strict=True) if name in used)
-
-
-def _used(program: Program) -> list[str]:
-    named = {name for _, expression in program.lines for name in Program.names_in(expression)}
-    return [name for name in program.inputs if name in named or name in program.outputs]
