@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
@@ -90,25 +91,40 @@ def timed_step_by_step(given: Problem) -> Callable[[], None]:
     return run
 
 
-def ours_block(given: Problem, *, fresh: bool) -> tuple[Callable[[], Block], Callable[[], None]]:
-    """``filter_block``, and the copy of as much memory in the same layout: y → x̂, a row of P → P, every γ read.
+class OursBlock:
+    """``filter_block`` over equal parts of the lanes, one a thread; and the copy of as much memory in the same layout.
 
-    fresh: into new memory; else over the last result.
+    The copy reads every y and γ and writes x̂ and P. fresh: both into new memory, else over the last result.
     """
-    y = np.ascontiguousarray(given.y.transpose(0, 2, 1))
-    kept = Block.empty(given.model, given.steps, given.lanes)
 
-    def run() -> Block:
-        return filter_block(given.model, y, given.arrived, out=None if fresh else kept)
+    def __init__(self, given: Problem, *, threads: int = 1, fresh: bool = False) -> None:
+        self._model, self._fresh, self._pool = given.model, fresh, ThreadPoolExecutor(threads)
+        self._y = [np.ascontiguousarray(part.transpose(0, 2, 1)) for part in np.array_split(given.y, threads, axis=1)]
+        self._arrived = [np.ascontiguousarray(part) for part in np.array_split(given.arrived, threads, axis=1)]
+        self._kept = [self._empty(part) for part in self._arrived]
 
-    def copy() -> None:
-        room = Block.empty(given.model, given.steps, given.lanes) if fresh else kept
-        np.count_nonzero(given.arrived)
+    def run(self) -> list[Block]:
+        return list(self._pool.map(self._filter, self._y, self._arrived, self._kept))
+
+    def copy(self) -> None:
+        list(self._pool.map(self._copy, self._y, self._arrived, self._kept))
+
+    def result(self) -> Result:
+        blocks = self.run()
+        x_hat = np.concatenate([block.x_hat for block in blocks], axis=2).transpose(0, 2, 1)
+        return x_hat, np.concatenate([block.P for block in blocks], axis=3).transpose(0, 3, 1, 2)
+
+    def _empty(self, arrived: NDArray[np.bool_]) -> Block:
+        return Block.empty(self._model, *arrived.shape)
+
+    def _filter(self, y: Floats, arrived: NDArray[np.bool_], kept: Block) -> Block:
+        return filter_block(self._model, y, arrived, out=None if self._fresh else kept)
+
+    def _copy(self, y: Floats, arrived: NDArray[np.bool_], kept: Block) -> None:
+        room = self._empty(arrived) if self._fresh else kept
+        np.count_nonzero(arrived)
         np.copyto(room.x_hat, y)
-        room.P_upper[:] = row
-
-    row = np.ones(kept.P_upper.shape[1:])
-    return run, copy
+        room.P_upper[:] = 1.0
 
 
 def numpy_batched(given: Problem) -> Result:
