@@ -21,7 +21,7 @@ from testbed.numerics.loops import COMPARISONS_MAX, Loop, loops
 from testbed.numerics.symbols import Program, Shape, traced
 
 LANES_MIN = 1024
-"""Lanes from which compiling pays; it takes about half a second a function."""
+"""Lanes from which compiling pays; it takes a second a function of two states, several of four."""
 SWITCH = "TESTBED_KERNELS"
 """Environment variable; ``off`` keeps to numpy."""
 
