@@ -13,8 +13,10 @@ from testbed.channel.loss import Chain
 from testbed.estimator.bounds import Bounds
 from testbed.estimator.model import Ack, Model
 from testbed.estimator.registry import create
+from testbed.numerics import kernels
 from testbed.numerics.kernels import LANES_MIN, SWITCH, available, kernel
 from testbed.numerics.lanes import Component, clip, exp, reciprocal, sqrt, where
+from testbed.numerics.loops import COMPARISONS_MAX
 
 pytest.importorskip("numba")
 
@@ -88,7 +90,10 @@ def strange(mask: Component, x: Component, y: Component) -> tuple[Component, ...
     return where(mask, first, second / (1.0 + first)), reciprocal(x) - first, x, 2.0
 
 
-def test_functions_are_cut_around_exp() -> None:
+@pytest.mark.parametrize("comparisons", [COMPARISONS_MAX, 0])
+def test_functions_are_cut_around_exp(comparisons: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no loop is short enough, what is needed later is kept instead."""
+    monkeypatch.setattr(kernels, "COMPARISONS_MAX", comparisons)
     shapes = (("mask", 1), ("scalar", 1), ("scalar", 1))
     run = kernel(strange, shapes, (("scalar", 1),) * 4, {"exp": exp})
     values = [0.0, -0.0, 1.0, -2.5, 1e-310, 1e300, np.inf, np.nan]
