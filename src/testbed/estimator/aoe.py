@@ -1,6 +1,7 @@
 """AOE: the approximate optimal estimator for unacknowledged Markov control losses (M Theorem 2, theory.md 3.4).
 
-For i.i.d. control losses it is the same estimator as GPB1 and IMM.
+For i.i.d. control losses it is the same estimator as GPB1 and IMM. For Gilbert–Elliott losses the posterior is that of
+the hidden state; there are still two hypotheses a step, since only ν moves the plant.
 """
 
 from __future__ import annotations
@@ -36,17 +37,17 @@ from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 _Weights = tuple[Component, Component]
-"""Posterior of ν = 0 and of ν = 1, each kept to full relative accuracy."""
+"""Of ν = 0 and of ν = 1, each kept to full relative accuracy."""
 
 
 class Aoe:
-    """One Gaussian and the posterior of the last ν; two hypotheses a step, merged by their moments."""
+    """One Gaussian and the posterior of the last state of the losses; two hypotheses a step, merged by moments."""
 
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
         self._advance = _stepper(model, lanes)
         self._x, self._p = model.prior(lanes)
-        self._posterior: _Weights | None = None  # of the last ν
+        self._states: list[Component] | None = None  # posterior of the last state of the losses
         self._k = 0
         self.counters: dict[str, int] = {}
 
@@ -54,25 +55,45 @@ class Aoe:
         """An ACK of ν_{k−1} decides between the hypotheses; older ones come too late and are counted."""
         gamma = mask_of(arrived)
         self._k += 1
-        weights = self._prior_weights(acks)
-        self._x, self._p, *posterior = self._advance(gamma, self._x, self._p, *weights, vector_of(u), vector_of(y))
-        self._posterior = posterior[0], posterior[1]
+        states = self._prior()
+        weights = self._by_fate(states)
+        known = self._decided(weights, acks)
+        self._x, self._p, *posterior = self._advance(gamma, self._x, self._p, *known, vector_of(u), vector_of(y))
+        self._states = self._shared(states, weights, (posterior[0], posterior[1]))
         return Estimate(self._x, self._p, self._lanes)
 
-    def _prior_weights(self, acks: tuple[Ack, ...]) -> _Weights:
-        """P(ν_{k−1} = 0) and P(ν_{k−1} = 1) before y_k, with the ACK of it if one came."""
-        chain, last = self._model.control, self._posterior
+    def _prior(self) -> list[Component]:
+        """P(state of packet k − 1), given what came before."""
+        law, last = self._model.law, self._states
         if last is None:
-            weights = full(1.0 - chain.start, self._lanes), full(chain.start, self._lanes)
-        else:
-            weights = (
-                (1.0 - chain.recovery) * last[0] + chain.failure * last[1],
-                chain.recovery * last[0] + (1.0 - chain.failure) * last[1],
-            )
+            return [full(float(start), self._lanes) for start in law.initial]
+        moves = law.transition.T.tolist()
+        return [_sum([move * weight for move, weight in zip(column, last, strict=True)]) for column in moves]
+
+    def _by_fate(self, states: list[Component]) -> _Weights:
+        law = self._model.law
+        lost, delivered = (_sum([states[h] for h in law.states_of(fate)]) for fate in (False, True))
+        return lost, delivered
+
+    def _decided(self, weights: _Weights, acks: tuple[Ack, ...]) -> _Weights:
+        """P(ν_{k−1} = 0) and P(ν_{k−1} = 1) before y_k, with the ACK of it if one came."""
         ack = newest_ack(acks, self._k - 1, self.counters)
         if ack is None:
             return weights
         return where(ack[0], 1.0 - ack[1], weights[0]), where(ack[0], ack[1], weights[1])
+
+    def _shared(self, states: list[Component], before: _Weights, after: _Weights) -> list[Component]:
+        """The posterior of ν shared out among the states of each fate, of which y_k and the ACK say nothing.
+
+        A fate of several states has ``before`` > 0, since each of the channel's states can give it.
+        """
+        law = self._model.law
+        shared: list[Component] = list(states)
+        for fate in (False, True):
+            among = law.states_of(fate)
+            for h in among:
+                shared[h] = after[fate] if len(among) == 1 else states[h] * (after[fate] / before[fate])
+        return shared
 
 
 def _advance(
@@ -99,6 +120,13 @@ def _advance(
 def _stepper(model: Model, lanes: int) -> Step:
     state: tuple[Shape, ...] = (("vector", model.n), ("symmetric", model.n), ("scalar", 1), ("scalar", 1))
     return masked_step(partial(_advance, model), (*state, ("vector", model.q), ("vector", model.p)), state, lanes)
+
+
+def _sum(terms: list[Component]) -> Component:
+    whole = terms[0]
+    for term in terms[1:]:
+        whole = whole + term
+    return whole
 
 
 def _bayes(weights: _Weights, odds: Component) -> _Weights:

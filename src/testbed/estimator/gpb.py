@@ -10,7 +10,8 @@ import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from testbed.estimator.mixtures import IMPOSSIBLE, merged, share, start_scores, transition_scores
+from testbed.estimator.fates import fates_of
+from testbed.estimator.mixtures import IMPOSSIBLE, Part, all_merged
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.riccati import Gain, log_odds, phi, predict
 from testbed.numerics.kernels import LANES_MIN
@@ -33,8 +34,6 @@ from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 MAX_ORDER = 12
-_Gaussian = tuple[Vector, Matrix, Component]
-"""Mean, covariance and score."""
 
 
 class Gpb:
@@ -53,7 +52,7 @@ class Gpb:
         self._p = symmetric(model.n, lambda i, j: np.full(lanes, float(model.P0[i, j])))
         self._score: Floats = np.zeros(lanes)
         self._bits = 0  # told apart
-        self._posterior: tuple[Floats, Floats] | None = None  # scores of the last ν, for order 0
+        self._fates = fates_of(model.law)
         self._k = 0
         self.counters: dict[str, int] = {}
 
@@ -78,6 +77,7 @@ class Gpb:
         self._p = symmetric(model.n, lambda i, j: np.concatenate([covariance[i][j]] * 2))
         self._score = np.concatenate(scores)
         self._bits += 1
+        self._fates.branch()
         self._level()
         estimate = self._moments()
         if self._bits > self._order:
@@ -98,15 +98,8 @@ class Gpb:
 
     def _priors(self, acks: tuple[Ack, ...]) -> list[Floats]:
         """log P(ν_{k−1} = 0 | hypothesis) and log P(ν_{k−1} = 1 | hypothesis), with the ACK of it if one came."""
-        chain, size = self._model.control, len(self._score)
-        rows = transition_scores(chain)
-        if self._k == 1:
-            priors = [np.full(size, score) for score in start_scores(chain)]
-        elif self._posterior is not None:
-            last = self._posterior
-            priors = [share(last[0] + rows[0][nu], last[1] + rows[1][nu])[2] for nu in (0, 1)]
-        else:
-            priors = [np.repeat([rows[0][nu], rows[1][nu]], size // 2) for nu in (0, 1)]
+        size = len(self._score)
+        priors = self._fates.priors(size)
         for ack in acks:
             if ack.j == self._k - 1:
                 for nu in (0, 1):
@@ -120,10 +113,9 @@ class Gpb:
 
     def _forget(self) -> None:
         """Merge the pairs that differ in the oldest bit alone."""
-        if self._order == 0:
-            self._posterior = self._score[: self._lanes], self._score[self._lanes :]
         every = self._x, self._p, self._score
         even, odd = (_mapped(partial(_oldest, bit=bit, lanes=self._lanes), every) for bit in (0, 1))
+        self._fates.merge(even[2], odd[2], self._lanes)
         self._x, self._p, self._score = _pairs_merged(self._model, even, odd)
         self._bits -= 1
 
@@ -159,9 +151,8 @@ def _advance(
     return idle, add(idle, shift), phi(covariance, gain, gamma), lost, delivered
 
 
-def _merge(x: Vector, P: Matrix, score: Component, z: Vector, R: Matrix, other: Component) -> _Gaussian:
-    *weights, both = share(score, other)
-    return (*merged((weights[0], weights[1]), (x, P), (z, R)), both)
+def _merge(x: Vector, P: Matrix, score: Component, z: Vector, R: Matrix, other: Component) -> Part:
+    return all_merged([(x, P, score), (z, R, other)])
 
 
 def _shapes(model: Model) -> tuple[Shape, ...]:
@@ -183,7 +174,7 @@ def _merger(model: Model, lanes: int) -> Callable[..., tuple[Any, ...]]:
     return many_lanes(_merge, (*shapes, *shapes), shapes, lanes)
 
 
-def _pairs_merged(model: Model, first: _Gaussian, second: _Gaussian) -> _Gaussian:
+def _pairs_merged(model: Model, first: Part, second: Part) -> Part:
     x, p, score = _merger(model, _kind(len(first[2])))(*first, *second)
     return x, p, score
 

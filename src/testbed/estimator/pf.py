@@ -9,6 +9,7 @@ import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
+from testbed.channel.law import Law
 from testbed.estimator.mixtures import IMPOSSIBLE
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.numerics.lanes import (
@@ -28,18 +29,18 @@ from testbed.numerics.streams import LaneStream
 
 @dataclass
 class _Cloud:
-    """Particles of one lane: x, n arrays (N,); nu (N,), the last control bits; scores (N,), logarithms of weights."""
+    """Particles of one lane: x, n arrays (N,); states (N,), the last of the losses; scores (N,), logs of weights."""
 
     x: Vector
-    nu: NDArray[np.bool_] | None
+    states: NDArray[np.intp] | None
     scores: Floats
 
 
 class Pf:
-    """``particles`` samples of x and of the last ν in each lane, drawn from the model and weighed by the likelihood.
+    """``particles`` samples of x and of the last state of the control losses in each lane.
 
-    Systematic resampling once the effective number of particles is below half of them. What is drawn depends on
-    ``seed``, the number of the lane and the step alone.
+    They are drawn from the model and weighed by the likelihood; systematic resampling once the effective number of
+    particles is below half of them. What is drawn depends on ``seed``, the number of the lane and the step alone.
     """
 
     def __init__(
@@ -108,22 +109,40 @@ class Pf:
     def _move(self, cloud: _Cloud, u: Floats, fate: bool | None, normals: Vector, uniforms: Floats) -> None:
         """Draw ν_{k−1} and x_k from the model; where ν is known, take it and weigh by its probability."""
         model = self._model
-        arrival = np.broadcast_to(model.control.arrival_given(cloud.nu), self._particles)
+        law, points = model.law, uniforms[:-1]
+        rows = law.initial if cloud.states is None else law.transition[cloud.states]
+        moves = np.broadcast_to(rows, (self._particles, len(law.arrived)))
+        arrival = moves[:, law.arrived].sum(axis=1)
         if fate is None:
-            cloud.nu = uniforms[:-1] < arrival
+            nu = points < arrival
+            points = np.where(nu, points, points - arrival)
         else:
+            chance = arrival if fate else 1.0 - arrival
             with np.errstate(divide="ignore"):
-                chance = np.log(arrival if fate else 1.0 - arrival)
-            cloud.scores = cloud.scores + np.maximum(chance, IMPOSSIBLE)
-            cloud.nu = np.full(self._particles, fate)
+                cloud.scores = cloud.scores + np.maximum(np.log(chance), IMPOSSIBLE)
+            nu, points = np.full(self._particles, fate), points * chance
+        cloud.states = _among(law, moves, nu, points)
         x = add(constant_times(model.a, cloud.x), constant_times(self._root, normals))
         push = model.control_effect([float(v) for v in u]) if model.q else [0.0] * model.n
-        cloud.x = [m + np.where(cloud.nu, b, 0.0) for m, b in zip(x, push, strict=True)]
+        cloud.x = [m + np.where(nu, b, 0.0) for m, b in zip(x, push, strict=True)]
 
     def _weigh(self, cloud: _Cloud, y: Floats) -> None:
         innovation = subtract([float(v) for v in y], constant_times(self._model.c, cloud.x))
         scores = cloud.scores - 0.5 * self._factor.quadratic(innovation)
         cloud.scores = scores - scores.max()
+
+
+def _among(law: Law, moves: Floats, nu: NDArray[np.bool_], points: Floats) -> NDArray[np.intp]:
+    """The state of each particle among those of its fate: where its point lies on their probabilities, side by side.
+
+    moves (N, H), nu (N,), points (N,) in 0 … P(that fate).
+    """
+    chosen = np.empty(len(nu), dtype=np.intp)
+    for fate in (False, True):
+        among, here = np.array(law.states_of(fate)), nu == fate
+        passed = points[here, None] >= np.cumsum(moves[here][:, among[:-1]], axis=1)
+        chosen[here] = among[passed.sum(axis=1)]
+    return chosen
 
 
 def _moments(x: Vector, weights: Floats) -> tuple[Floats, Floats]:
@@ -143,7 +162,7 @@ def _resample(cloud: _Cloud, weights: Floats, uniform: float) -> None:
     chosen = np.searchsorted(np.cumsum(weights), (uniform + np.arange(count)) / count, side="right")
     chosen = np.minimum(chosen, count - 1)
     cloud.x = [component[chosen] for component in cloud.x]
-    cloud.nu = None if cloud.nu is None else cloud.nu[chosen]
+    cloud.states = None if cloud.states is None else cloud.states[chosen]
     cloud.scores = np.zeros(count)
 
 
