@@ -59,6 +59,12 @@ def _facts(figures: dict[str, Any]) -> Table:
         link = figures[name]
         text = f"{_number(link['stationary_loss'])} lost, bursts of {_number(link['mean_burst'])} on average"
         rows.append((f"{name} link", text if link["mean_burst"] or link["stationary_loss"] else "no losses"))
+    for name in ("observation", "control"):
+        link = figures[name]
+        if link["recovery"] is None:
+            near, further = _number(link["correlation"]), _number(link["memory"])
+            rows.append((f"{name} link, θ", f"{_number(link['burst_decay'])}: P(m losses in a row) falls like θ^m"))
+            rows.append((f"{name} link, correlation", f"{near} between neighbours, times {further} a packet"))
     if observation["burst_99"] is not None:
         rows.append(("bursts, 99 %", f"at most {observation['burst_99']} on the observation link"))
     rows += [
