@@ -44,6 +44,7 @@ SCENARIO_TABLES = (
     ("NoLoss", '`loss = { kind = "none" }`', ""),
     ("BernoulliLoss", '`loss = { kind = "bernoulli", … }`', ""),
     ("MarkovLoss", '`loss = { kind = "markov", … }`', ""),
+    ("GilbertElliottLoss", '`loss = { kind = "gilbert-elliott", … }`', ""),
     ("EstimatorSpec", "`[[estimators]]`", ""),
     ("Clock", "`[clock]`", ""),
     ("Transport", "`[transport]`", ""),

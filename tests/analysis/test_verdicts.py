@@ -68,6 +68,70 @@ def test_observation_losses(system: dict[str, Any], loss: dict[str, Any] | None,
     assert verdict == (expected if isinstance(expected, tuple) else (True, expected))
 
 
+def hidden(to_bad: float, to_good: float, loss_good: float = 0.0, loss_bad: float = 1.0) -> dict[str, Any]:
+    return {
+        "kind": "gilbert-elliott",
+        "to_bad": to_bad,
+        "to_good": to_good,
+        "loss_good": loss_good,
+        "loss_bad": loss_bad,
+    }
+
+
+P3_C2 = {**P3, "C": [[1.0, 0.0], [0.0, 1.0]], "R": P3["Q"]}
+
+
+@pytest.mark.parametrize(
+    ("system", "loss", "expected"),
+    [
+        (SCALAR, hidden(0.1, 0.2, 0.1, 0.7), (False, "bursts")),
+        (SCALAR, hidden(0.1, 0.5, 0.1, 0.7), (True, "bursts")),
+        (P3_C2, hidden(0.1, 0.5, 0.1, 0.7), (True, "bursts")),
+        (P3, hidden(0.1, 0.5, 0.1, 0.7), (True, "domination, M Theorem 5")),
+        (P3, hidden(0.9, 0.9, 0.1, 0.5), (True, "domination, M Theorem 5")),
+        (P3, hidden(0.9, 0.9, 0.1, 0.9), (None, "none")),
+        (P3, hidden(0.1, 0.2, 0.1, 0.9), (False, "bursts")),
+        (ROTATION, hidden(0.1, 0.3, 0.05, 0.2), (True, "domination, Sinopoli upper bound")),
+        (ROTATION, hidden(0.1, 0.3, 0.05, 0.6), (None, "none")),
+        ({**P3, "A": [[0.9, 0.0], [0.0, 0.2]], "C": [[0.0, 0.0]]}, hidden(0.1, 0.2, 0.1, 0.9), (True, "ρ(A) < 1")),
+    ],
+)
+def test_observation_losses_with_a_hidden_state(system: dict[str, Any], loss: dict[str, Any], expected: Any) -> None:
+    found = figures(system, loss)
+    assert of(found, "observation") == expected
+    assert found["peak"]["stable"] is None
+    assert json.dumps(found, allow_nan=False)
+
+
+@pytest.mark.parametrize("system", [M, SCALAR, P3, ROTATION])
+@pytest.mark.parametrize(("recovery", "failure"), [(0.3, 0.2), (0.65, 0.03), (0.8, 0.3)])
+def test_a_hidden_state_that_is_the_fate_has_the_verdicts_of_the_chain(
+    system: dict[str, Any], recovery: float, failure: float
+) -> None:
+    links = {"links": {"control": {"loss": markov(recovery, failure)}}} if "B" in system else {}
+    chain = figures(system, markov(recovery, failure), **links)
+    same = figures(system, hidden(failure, recovery), **links)
+    assert {**same, "observation": {**same["observation"], "kind": "markov"}} == chain
+
+
+@pytest.mark.parametrize(("to_good", "finite"), [(0.5, True), (0.05, False)])
+def test_moments_with_a_hidden_state(to_good: float, finite: bool) -> None:
+    """The tail of P(m losses in a row), summed with the growth of the covariance: P_m = a² P_{m−1} + q."""
+    loss = hidden(0.1, to_good, 0.1, 0.75)
+    found = figures({**SCALAR, "A": [[1.2]]}, loss)
+    assert (found["moments"]["finite_mean"], found["moments"]["finite_variance"]) == (finite, finite)
+    block = np.array([[0.9 * 0.1, 0.1 * 0.75], [to_good * 0.1, (1 - to_good) * 0.75]])
+    tails = [np.linalg.matrix_power(block, m).sum(axis=1).max() * 1.2 ** (4 * m) for m in (40, 80)]
+    assert (tails[1] < tails[0]) == finite
+
+
+def test_control_losses_with_a_hidden_state() -> None:
+    links = {"control": {"loss": hidden(0.1, 0.5, 0.1, 0.7)}}
+    assert of(figures(M, markov(0.41), links=links), "control") == (True, "S, correlated")
+    alternating = {"control": {"loss": hidden(1.0, 1.0, 0.1, 0.7)}}
+    assert of(figures(M, markov(0.41), links=alternating), "control") == (None, "S, correlated")
+
+
 def expected_trace(system: dict[str, Any], recovery: float, failure: float, steps: int) -> float:
     """Mean over 4000 lanes of tr P̄_k of the Kalman filter, the loss chain started at its stationary law."""
     rng = np.random.default_rng(7)

@@ -12,7 +12,7 @@ from scipy.linalg import solve_discrete_are
 
 from testbed.analysis.moments import spectral_radius
 from testbed.analysis.structure import Reach
-from testbed.channel.loss import Chain
+from testbed.channel.law import LossModel
 from testbed.numerics.lanes import Floats
 from testbed.scenario import (
     ConstantInput,
@@ -66,10 +66,10 @@ def settled(A: Floats, C: Floats, Q: Floats, R: Floats) -> Settled | None:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """The chains of observations and of controls, and whether every ACK comes."""
+    """The losses of observations and of controls, and whether every ACK comes."""
 
-    observation: Chain
-    control: Chain
+    observation: LossModel
+    control: LossModel
     every_ack: bool
 
 

@@ -43,7 +43,12 @@ def robust_figures(scenario: Scenario) -> list[dict[str, Any]] | None:
         entry: dict[str, Any] = {"name": spec.name, "mu": made.mu}
         try:
             recursion = RobustRecursion.of(model, made.weight)
-            out.append({**entry, **_figures(recursion, model.observation, model.P0)})
+            chain = model.observation.as_chain
+            if chain is None:
+                reason = "R is about independent and Markov arrivals, not Gilbert–Elliott ones"
+                out.append({**entry, **_NOTHING, **_answer(None, "R Theorem 5", reason)})
+            else:
+                out.append({**entry, **_figures(recursion, chain, model.P0)})
         except (np.linalg.LinAlgError, ValueError):
             out.append({**entry, **_NOTHING, **_answer(None, "R Theorem 5", "the numbers overflow")})
     return out

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from testbed.analysis.bursts import delivered_run, lost_run
+from testbed.analysis.bursts import delivered_run, lost_run, run_law
 from testbed.analysis.convergence import Knowledge, convergence, settled
 from testbed.analysis.critical import CriticalArrival, critical_arrival, observed_at_once, recovery_threshold
 from testbed.analysis.moments import finite_moment_order, spectral_radius
@@ -17,6 +17,8 @@ from testbed.analysis.robust_verdicts import robust_figures
 from testbed.analysis.strong import StrongObservability, strong_observability
 from testbed.analysis.structure import Reach, controllability, observability, unstable_eigenvalues
 from testbed.channel.chains import chain_of
+from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain
 from testbed.numerics.lanes import Floats
 from testbed.scenario import FeedbackInput, Input, Links, Loss, Scenario
@@ -69,14 +71,21 @@ class Facts:
         """Whether the noise reaches every eigenvalue outside the open unit disc."""
         return self.controllable.stable_rest
 
-    def growth(self, chain: Chain) -> float:
-        """ρ² (1 − recovery): what a burst grows by, times the probability that it goes on; maybe infinite."""
-        return self.radius * self.radius * (1.0 - chain.recovery) if chain.recovery < 1.0 else 0.0
+    def growth(self, losses: LossModel) -> float:
+        """ρ² θ: what a burst grows by, times the factor by which longer ones are rarer; maybe infinite.
+
+        θ = 1 − recovery for a chain of arrivals.
+        """
+        return self.radius * self.radius * losses.burst_decay if losses.burst_decay > 0.0 else 0.0
+
+    @property
+    def strongly_built(self) -> bool:
+        """M Assumptions 1, but for the chain (controllable, observable), and 2."""
+        return self.controllable.full and self.observable.full and self.strong.holds
 
     def strongly(self, chain: Chain) -> bool:
         """Whether M Theorem 5 applies: M Assumptions 1 (controllable, observable, the chain irreducible) and 2."""
-        structure = self.controllable.full and self.observable.full and self.strong.holds
-        return structure and chain.recovery > 0.0 and chain.failure > 0.0
+        return self.strongly_built and chain.recovery > 0.0 and chain.failure > 0.0
 
     @property
     def scalar(self) -> bool:
@@ -99,7 +108,7 @@ def analyze(scenario: Scenario) -> dict[str, Any]:
 def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
     A = facts.A
     observed, controlled = scenario.links.observation.loss, scenario.links.control.loss
-    chain = chain_of(observed)
+    chain, control = _simplest(chain_of(observed)), _simplest(chain_of(controlled))
     verdict = observation_verdict(facts, chain)
     return {
         "name": scenario.name,
@@ -124,8 +133,8 @@ def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
         "critical_recovery": recovery_threshold(A),
         "observation": {**_link(observed, chain), **verdict.table()},
         "control": {
-            **_link(controlled, chain_of(controlled)),
-            **control_verdict(verdict, chain_of(controlled), scenario.input, scenario.links).table(),
+            **_link(controlled, control),
+            **control_verdict(verdict, control, scenario.input, scenario.links).table(),
         },
         "bounds": {
             "lower": Verdict(verdict.stable, verdict.theorem, f"covariance with every ACK: {verdict.reason}").table(),
@@ -144,7 +153,12 @@ def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
     }
 
 
-def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
+def _simplest(losses: LossModel) -> LossModel:
+    """The chain of arrivals that a Gilbert–Elliott channel is, if it is one: then the theorems for chains hold."""
+    return (losses.as_chain or losses) if isinstance(losses, GilbertElliott) else losses
+
+
+def observation_verdict(facts: Facts, chain: LossModel) -> Verdict:
     """Whether the expected covariance with every ACK stays bounded, for the observation link ``chain``."""
     if facts.radius < 1.0:
         return Verdict(True, "ρ(A) < 1", "the covariance stays bounded without any observation")
@@ -159,6 +173,8 @@ def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
         return Verdict(None, "none", "no losses, but the noise does not reach all that grows")
     if not facts.noise_feeds_growth:
         return Verdict(None, "none", "(A, sqrt Q) is not stabilisable: no theorem here applies")
+    if isinstance(chain, GilbertElliott):
+        return hidden_verdict(facts, chain)
     threshold = recovery_threshold(facts.A)
     growth = f"ρ²(1 − recovery) = {facts.growth(chain):.6g}"
     if threshold == 0.0 and chain.recovery > 0.0:
@@ -182,12 +198,43 @@ def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
     return Verdict(None, "none", f"{below}: {why}; {facts.strong.reason}")
 
 
-def control_verdict(observation: Verdict, chain: Chain, source: Input | None, links: Links) -> Verdict:
+def hidden_verdict(facts: Facts, losses: GilbertElliott) -> Verdict:
+    """The same for a hidden chain behind the arrivals, where the system is detectable and the noise feeds its growth.
+
+    Necessary: E[P̄_k] ≥ Σ_m P(the last m packets lost) A^m Q A'^m, and that probability falls like θ^m. Sufficient: if
+    one observation determines the unstable part, that sum with A^m A'^m bounds it from above too. Otherwise the
+    arrivals dominate independent ones: P(lost | past) is at most ``worst_loss`` in the end, and P is monotone in γ, so
+    that what holds for independent losses of more than that rate holds here.
+    """
+    theta, worst, threshold = losses.burst_decay, losses.worst_loss, recovery_threshold(facts.A)
+    growth = f"ρ²θ = {facts.growth(losses):.6g}"
+    if _equal(theta, 1.0 - threshold):
+        return Verdict(None, "none", f"{growth}: at the threshold θ = {1.0 - threshold:.6g}, which is not decided")
+    if theta > 1.0 - threshold:
+        return Verdict(False, "bursts", f"{growth} > 1: a burst of losses outgrows its probability")
+    if observed_at_once(facts.A, facts.C):
+        return Verdict(True, "bursts", f"{growth} < 1, one observation determines the unstable part")
+    arrival = f"arrivals dominate independent ones of rate {1.0 - worst:.6g}"
+    if facts.strongly_built and worst < 1.0 - threshold and not _equal(worst, 1.0 - threshold):
+        return Verdict(True, "domination, M Theorem 5", f"{arrival} > {threshold:.6g}, strongly observable")
+    upper = facts.critical.upper
+    if upper is not None and 1.0 - worst > upper and not _equal(1.0 - worst, upper):
+        return Verdict(True, "domination, Sinopoli upper bound", f"{arrival} > {upper:.6g}")
+    return Verdict(None, "none", f"{growth} < 1: necessary, not known to be sufficient; {facts.strong.reason}")
+
+
+def control_verdict(observation: Verdict, chain: LossModel, source: Input | None, links: Links) -> Verdict:
     """Whether losses of controls leave the expected covariance of OE and AOE bounded (D Theorem 2, M Theorem 4)."""
     if source is None or chain.never_loses or links.ack.mode == "perfect":
         known = "there is no input" if source is None else "the fate of every control packet is known"
         return Verdict(observation.stable, "separation", f"{known}: as with the observation link alone")
     theorem = "D Theorem 2" if chain.independent else "M Theorem 4"
+    if isinstance(chain, GilbertElliott):
+        theorem = "S, correlated"
+        if abs(chain.memory) == 1.0:
+            return Verdict(
+                False if observation.stable is False else None, theorem, "the states alternate: S is not bounded"
+            )
     if isinstance(source, FeedbackInput):
         return Verdict(
             False if observation.stable is False else None, theorem, "u is fed back, so that its bound is not known"
@@ -204,10 +251,12 @@ def upper_bound_verdict(observation: Verdict, source: Input | None) -> Verdict:
     return Verdict(observation.stable, "M Theorem 3", "the recursion with every ACK, and ¼ U more noise")
 
 
-def peak_figures(facts: Facts, chain: Chain) -> dict[str, Any]:
+def peak_figures(facts: Facts, chain: LossModel) -> dict[str, Any]:
     """P Theorem 6, and Theorem 8 for scalar systems."""
     out: dict[str, Any] = dict.fromkeys(("condition_i", "condition_ii", "left_side", "d", "series", "series_tail"))
     out |= {"failure_max": None, "critical_recovery": recovery_threshold(facts.A)}
+    if isinstance(chain, GilbertElliott):
+        return {**out, **Verdict(None, "none", "P is for Markov arrivals, and these have a hidden state").table()}
     if not facts.observable.full:
         return {**out, **Verdict(None, "P Theorem 6", "(A, C) is not observable").table()}
     index, condition_i = facts.observable.index, facts.growth(chain) < 1.0
@@ -238,7 +287,7 @@ def _peak_verdict(facts: Facts, chain: Chain, first: bool, second: bool | None) 
     return Verdict(None, "P Theorem 6", "condition (ii) is not known to hold; it is sufficient only")
 
 
-def moment_figures(facts: Facts, chain: Chain, observation: Verdict) -> dict[str, Any]:
+def moment_figures(facts: Facts, chain: LossModel, observation: Verdict) -> dict[str, Any]:
     """Order of the finite moments of the covariance (P Corollary 9); None where nothing is decided.
 
     Necessary in general. Sufficient for scalar systems, and where one observation determines the unstable part.
@@ -256,7 +305,7 @@ def moment_figures(facts: Facts, chain: Chain, observation: Verdict) -> dict[str
             return False
         if order <= r and facts.noise_feeds_growth:
             return False
-        return True if sufficient and order > r and facts.radius > 1.0 and chain.recovery > 0.0 else None
+        return True if sufficient and order > r and facts.radius > 1.0 and chain.burst_decay < 1.0 else None
 
     return {
         "order": order,
@@ -276,18 +325,24 @@ def _equal(a: float, b: float) -> bool:
     return math.isclose(a, b, rel_tol=_AT_THRESHOLD)
 
 
-def _link(loss: Loss, chain: Chain) -> dict[str, Any]:
+def _link(loss: Loss, losses: LossModel) -> dict[str, Any]:
     """The figures of a link's losses; lengths that are infinite, or of what never comes, are None."""
-    bad, good = lost_run(chain), delivered_run(chain)
-    loses = not chain.never_loses
+    hidden = isinstance(losses, GilbertElliott)
+    bad = run_law(losses, False) if isinstance(losses, GilbertElliott) else lost_run(losses)
+    good = run_law(losses, True) if isinstance(losses, GilbertElliott) else delivered_run(losses)
+    if losses.never_loses:
+        bad = None
     return {
         "kind": loss.kind,
-        "recovery": chain.recovery,
-        "failure": chain.failure,
-        "stationary_loss": 1.0 - chain.arrival,
-        "mean_burst": bad.mean if loses else None,
-        "burst_99": bad.quantile(0.99) if loses else None,
-        "mean_good_run": good.mean,
+        "recovery": None if hidden else losses.recovery,
+        "failure": None if hidden else losses.failure,
+        "stationary_loss": 1.0 - losses.arrival,
+        "mean_burst": bad.mean if bad is not None else None,
+        "burst_99": bad.quantile(0.99) if bad is not None else None,
+        "mean_good_run": good.mean if good is not None else None,
+        "burst_decay": losses.burst_decay,
+        "correlation": losses.coupling * losses.memory,
+        "memory": losses.memory,
     }
 
 

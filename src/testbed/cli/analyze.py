@@ -124,11 +124,22 @@ def _robust(figures: dict[str, Any]) -> Table:
 
 
 def _link(link: dict[str, Any], name: str) -> list[tuple[str, str]]:
-    """The stationary loss, and the geometric laws of the lengths l of runs."""
+    """The stationary loss, and the laws of the lengths l of runs: geometric ones for a chain of arrivals."""
     if link["mean_burst"] is None and not link["stationary_loss"]:
         return [(f"{name} link", "no losses")]
+    lost = f"{_number(link['stationary_loss'])} lost in the long run"
+    if link["recovery"] is None:
+        longest = "" if link["burst_99"] is None else f", 99 % at most {link['burst_99']}"
+        near, further = _number(link["correlation"]), _number(link["memory"])
+        return [
+            (f"{name} link", lost),
+            ("its bursts of losses", f"mean {_number(link['mean_burst'])}{longest}"),
+            ("its runs of deliveries", f"mean {_number(link['mean_good_run'])}"),
+            ("its θ", f"{_number(link['burst_decay'])}: P(m losses in a row) falls like θ^m"),
+            ("its correlation", f"{near} between neighbours, times {further} a packet"),
+        ]
     return [
-        (f"{name} link", f"{_number(link['stationary_loss'])} lost in the long run"),
+        (f"{name} link", lost),
         ("its bursts of losses", _law(link["recovery"], link["burst_99"])),
         ("its runs of deliveries", _law(link["failure"], None)),
     ]
