@@ -157,7 +157,7 @@ def test_worst_loss_is_reached_by_a_long_burst() -> None:
 )
 def test_what_is_a_chain_of_arrivals_is_taken_for_one(losses: GilbertElliott, chain: Chain) -> None:
     assert losses.as_chain is not None
-    for figure in ("never_loses", "independent", "first_arrival", "burst_decay"):
+    for figure in ("never_loses", "independent", "first_arrival", "burst_decay", "recovery", "failure", "start"):
         assert getattr(losses, figure) == pytest.approx(getattr(chain, figure), rel=1e-14)
     for fates in product((0, 1), repeat=3):
         steps = [chain.first_arrival, *(1.0 - chain.failure if last else chain.recovery for last in fates[:-1])]

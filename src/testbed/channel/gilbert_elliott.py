@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 
@@ -39,19 +38,19 @@ class GilbertElliott:
         return cls(Chain.markov(to_good, to_bad, start_good), loss_good, loss_bad)
 
     @property
-    def recovery(self) -> NoReturn:
-        """Raises UsageError, for what holds for a Markov chain of arrivals only."""
-        raise _not_markov()
+    def recovery(self) -> float:
+        """That of ``as_chain``. Raises UsageError where there is none."""
+        return self._chain().recovery
 
     @property
-    def failure(self) -> NoReturn:
-        """Raises UsageError, for what holds for a Markov chain of arrivals only."""
-        raise _not_markov()
+    def failure(self) -> float:
+        """That of ``as_chain``. Raises UsageError where there is none."""
+        return self._chain().failure
 
     @property
-    def start(self) -> NoReturn:
-        """Raises UsageError, for what holds for a Markov chain of arrivals only."""
-        raise _not_markov()
+    def start(self) -> float:
+        """That of ``as_chain``. Raises UsageError where there is none."""
+        return self._chain().start
 
     @property
     def never_loses(self) -> bool:
@@ -142,12 +141,15 @@ class GilbertElliott:
         """P(loss) where the state is good with this probability."""
         return good * self.loss_good + (1.0 - good) * self.loss_bad
 
-
-def _not_markov() -> UsageError:
-    return UsageError(
-        "Gilbert-Elliott losses have no recovery and failure rate, and this holds for Markov losses only; "
-        "allowed here: none, bernoulli, markov, or gilbert-elliott with loss_good = 0 and loss_bad = 1"
-    )
+    def _chain(self) -> Chain:
+        """For what holds for chains of arrivals alone, so that it is not silently wrong here."""
+        chain = self.as_chain
+        if chain is None:
+            raise UsageError(
+                "Gilbert-Elliott losses have no recovery and failure rate, and this holds for Markov losses only; "
+                "allowed here: none, bernoulli, markov, or gilbert-elliott with loss_good = 0 and loss_bad = 1"
+            )
+        return chain
 
 
 class GilbertElliottProcess:

@@ -50,6 +50,8 @@ class Aoe:
         self._model, self._lanes = model, lanes
         self._advance = _stepper(model, lanes)
         self._x, self._p = model.prior(lanes)
+        self._moves: list[list[float]] = model.law.transition.T.tolist()
+        self._among = model.law.states_of(False), model.law.states_of(True)
         self._states: list[Component] | None = None  # posterior of the last state of the losses
         self._k = 0
         self.counters: dict[str, int] = {}
@@ -85,16 +87,14 @@ class Aoe:
 
     def _prior(self) -> list[Component]:
         """P(state of packet k − 1), given what came before."""
-        law, last = self._model.law, self._states
+        last = self._states
         if last is None:
-            return [full(float(start), self._lanes) for start in law.initial]
-        moves = law.transition.T.tolist()
-        return [_sum([move * weight for move, weight in zip(column, last, strict=True)]) for column in moves]
+            return [full(float(start), self._lanes) for start in self._model.law.initial]
+        return [_sum([move * weight for move, weight in zip(column, last, strict=True)]) for column in self._moves]
 
     def _by_fate(self, states: list[Component]) -> _Weights:
-        law = self._model.law
-        lost, delivered = (_sum([states[h] for h in law.states_of(fate)]) for fate in (False, True))
-        return lost, delivered
+        lost, delivered = self._among
+        return _sum([states[h] for h in lost]), _sum([states[h] for h in delivered])
 
     def _decided(self, weights: _Weights, acks: tuple[Ack, ...]) -> _Weights:
         """P(ν_{k−1} = 0) and P(ν_{k−1} = 1) before y_k, with the ACK of it if one came."""
@@ -108,12 +108,10 @@ class Aoe:
 
         A fate of several states has ``before`` > 0, since each of the channel's states can give it.
         """
-        law = self._model.law
-        shared: list[Component] = list(states)
-        for fate in (False, True):
-            among = law.states_of(fate)
+        shared = list(states)
+        for among, had, has in zip(self._among, before, after, strict=True):
             for h in among:
-                shared[h] = after[fate] if len(among) == 1 else states[h] * (after[fate] / before[fate])
+                shared[h] = has if len(among) == 1 else states[h] * (has / had)
         return shared
 
 

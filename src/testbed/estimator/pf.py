@@ -198,6 +198,8 @@ def _among(law: Law, moves: Floats, nu: NDArray[np.bool_], points: Floats) -> ND
 
     moves (N, H), nu (N,), points (N,) in 0 … P(that fate).
     """
+    if law.visible:
+        return nu.astype(np.intp)
     chosen = np.empty(len(nu), dtype=np.intp)
     for fate in (False, True):
         among, here = np.array(law.states_of(fate)), nu == fate
