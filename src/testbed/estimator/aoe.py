@@ -53,6 +53,8 @@ class Aoe:
         self._moves: list[list[float]] = model.law.transition.T.tolist()
         self._among = model.law.states_of(False), model.law.states_of(True)
         self._states: list[Component] | None = None  # posterior of the last state of the losses
+        law = model.law
+        self._visible, self._moves = law.visible, law.transition.T.tolist()
         self._k = 0
         self.counters: dict[str, int] = {}
 
