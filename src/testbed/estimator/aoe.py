@@ -51,10 +51,9 @@ class Aoe:
         self._advance = _stepper(model, lanes)
         self._x, self._p = model.prior(lanes)
         self._moves: list[list[float]] = model.law.transition.T.tolist()
+        self._visible = model.law.visible
         self._among = model.law.states_of(False), model.law.states_of(True)
         self._states: list[Component] | None = None  # posterior of the last state of the losses
-        law = model.law
-        self._visible, self._moves = law.visible, law.transition.T.tolist()
         self._k = 0
         self.counters: dict[str, int] = {}
 
@@ -92,9 +91,13 @@ class Aoe:
         last = self._states
         if last is None:
             return [full(float(start), self._lanes) for start in self._model.law.initial]
+        if self._visible:
+            return [column[0] * last[0] + column[1] * last[1] for column in self._moves]
         return [_sum([move * weight for move, weight in zip(column, last, strict=True)]) for column in self._moves]
 
     def _by_fate(self, states: list[Component]) -> _Weights:
+        if self._visible:
+            return states[0], states[1]
         lost, delivered = self._among
         return _sum([states[h] for h in lost]), _sum([states[h] for h in delivered])
 
@@ -110,6 +113,8 @@ class Aoe:
 
         A fate of several states has ``before`` > 0, since each of the channel's states can give it.
         """
+        if self._visible:
+            return list(after)
         shared = list(states)
         for among, had, has in zip(self._among, before, after, strict=True):
             for h in among:
