@@ -199,7 +199,7 @@ class Records:
 @dataclass(frozen=True, eq=False)
 class Certificate:
     """Of one lane. expansions: r. log_low, log_high: Σ log(1 − ε), Σ log(1 + ε). given_up (2,): Σ ρ_r and
-    Σ ρ_r (2 n + ζ_max²) of those that are no longer held. ack (n, n): Pᴬ. peak (3,): largest η, ½ tr ΩV and ½ |B u| of
+    Σ ρ_r (2 n + ζ_max²) of those that are no longer held. ack (n, n): Pᴬ. peak (3,): largest η, tr Ω and ½ |B u| of
     late.
     """
 
@@ -230,7 +230,7 @@ class Certificate:
         if not self.records.count:
             return replace(self, ack=ack)
         records = self.records.seen(model, y)
-        newest = np.array([records.eta.max(), records.kept.max(), 0.0])
+        newest = np.array([records.eta.max(), float(np.einsum("rii->r", records.information).max()), 0.0])
         return replace(self, ack=ack, records=records, peak=np.maximum(self.peak, newest))
 
     def expanded(self, remainder: Remainder, axes: Floats, centre: Floats, epsilon: float) -> Certificate:
@@ -267,9 +267,9 @@ class Certificate:
         )
 
     def expected(self) -> tuple[float, float]:
-        """What η and ½ tr ΩV of the next re-expansion may come to, judged by those before; no bound hangs on it."""
-        eta, kept, push = (float(v) for v in self.peak)
-        return 1.5 * max(eta, push) + 2.0, 1.5 * kept + 2.0
+        """What η and tr Ω of the next re-expansion may come to, judged by those before; no bound hangs on it."""
+        eta, information, push = (float(v) for v in self.peak)
+        return 1.5 * max(eta, push) + 2.0, 1.5 * information
 
     @property
     def left_out(self) -> float:

@@ -39,7 +39,7 @@ BINS = 64
 """Radii at which the mass of what is left out is kept."""
 _CELLS = 4_000_000
 """Entries of an array between two axes."""
-_LOWEST = -650.0
+LOWEST = -650.0
 _SMALLEST = -680.0
 """Logarithms of the smallest cut and of the smallest weight that is formed."""
 
@@ -106,16 +106,19 @@ class Cloud:
         """Logarithm of the weight of each hidden state that is possible, the largest 0."""
         self.logs = shares[self.states] - sums[:, None, None]
         """Logarithms of the components' shares of their hidden state's weight, (S', H, N)."""
-        self.radii = np.sqrt((self.places**2).sum(axis=2))
+        squares = (self.places**2).sum(axis=2)
+        self.radii = np.sqrt(squares)
+        self.spread = float((np.exp(self.logs) * squares).sum(axis=(1, 2)).max())
+        """Largest second moment of the components of a hidden state."""
 
     def log_cut(self, eta: float, target: float) -> float:
         """A cut for which what is left out comes to about ``target``, a logarithm, for an exponent η."""
         n = self.places.shape[2]
-        some = self.logs > _LOWEST
+        some = self.logs > LOWEST
         logs, radii = self.logs[some], np.broadcast_to(self.radii, some.shape)[some]
         fixed = math.log(2.0 * n * len(logs)) + float(log_tail(eta)) - target
         cut = -fixed
-        while cut > _LOWEST:
+        while cut > LOWEST:
             furthest = float(
                 (radii + np.sqrt(2.0 * SPLIT * np.maximum(logs - cut, 0.0))).max(where=logs > cut, initial=0.0)
             )
@@ -123,7 +126,7 @@ class Cloud:
             if excess <= 0.0:
                 return cut
             cut -= 1.2 * excess + 1.0
-        return _LOWEST
+        return LOWEST
 
 
 def expanded(cloud: Cloud, h: float, log_cut: float) -> tuple[Posterior, Remainder, float]:

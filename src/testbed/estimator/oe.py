@@ -20,9 +20,8 @@ from testbed.numerics.lanes import Floats, matrices_of, matrix_of, vector_of
 from testbed.numerics.ragged import Arrays, packed, unpacked
 from testbed.scenario import Scenario
 
-STATES_MAX = 3
-ENUMERATED = 512
-"""Histories from which a lane goes to the lattice, unless ``max_histories`` says otherwise."""
+ENUMERATED = {1: 4096, 2: 4096, 3: 512}
+"""Histories from which a lane goes to the lattice, for one, two and three states; above, there is none."""
 
 
 class Oe(OeExact):
@@ -30,8 +29,8 @@ class Oe(OeExact):
 
     tolerance: aim of ``error_bound``, the bound on ‖x̂ − exact‖ in units of sqrt(tr P), for a run of any length; 0 in
     the estimates that are exact. max_histories: histories that are enumerated before the posterior goes to a lattice,
-    by default 512, or 65536 where there is none: for more than three states. max_lag: how many steps late an ACK may
-    be and still be used once its packet's fates are merged.
+    by default 4096, or 512 for three states; above three there is no lattice, and it is the limit, by default 65536.
+    max_lag: how many steps late an ACK may be and still be used once its packet's fates are merged.
     """
 
     _name, _other = "oe", "aoe"
@@ -44,8 +43,8 @@ class Oe(OeExact):
         max_histories: Annotated[int, Ge(1)] | None = None,
         max_lag: Annotated[int, Ge(0)] = 64,
     ) -> None:
-        self._lattice = model.n <= STATES_MAX
-        limit = max_histories or (ENUMERATED if self._lattice else MAX_HISTORIES)
+        self._lattice = model.n in ENUMERATED
+        limit = max_histories or ENUMERATED.get(model.n, MAX_HISTORIES)
         self._beyond: dict[int, Lane] = {}
         super().__init__(model, lanes, limit)
         self._settings = Settings(model, self._fates, tolerance, limit, max_lag)

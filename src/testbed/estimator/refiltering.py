@@ -14,7 +14,7 @@ import numpy as np
 
 from testbed.estimator.certificate import Certificate, Records
 from testbed.estimator.errors import TooManyHistories
-from testbed.estimator.lattice import Cloud, expanded, poisson, spacing
+from testbed.estimator.lattice import LOWEST, Cloud, expanded, poisson, spacing
 from testbed.estimator.model import Model
 from testbed.estimator.posterior import Fates, Posterior, decided, predicted, updated
 from testbed.numerics.lanes import Floats
@@ -26,6 +26,8 @@ LEFT_OUT_MAX = 1e-3
 """Share of the tolerance from which what was left out is too much."""
 COMPONENTS_MAX = 4_000_000
 """Components that a lane may reach where it cannot be re-expanded."""
+WAITING_MAX = 65536
+"""Components up to which a re-expansion is put off that would leave out too much."""
 _EARLY = 50.0
 """Re-expansion r gets a share of the tolerance in proportion to (r + _EARLY)^{−3/2}: the sum of all is finite."""
 
@@ -226,8 +228,10 @@ def _reexpanded(settings: Settings, posterior: Posterior, certificate: Certifica
         return posterior, certificate
     share = settings.tolerance * 0.5 * math.sqrt(_EARLY) * (certificate.expansions + _EARLY) ** -1.5
     cloud = Cloud(posterior)
-    eta, below = certificate.expected()
-    log_cut = cloud.log_cut(eta, math.log(1e-4 * share) - below)
+    eta, information = certificate.expected()
+    log_cut = cloud.log_cut(eta, math.log(1e-4 * share) - 0.5 * information * cloud.spread)
+    if log_cut <= LOWEST and posterior.components <= WAITING_MAX:
+        return posterior, certificate  # too wide now; an observation will draw it together
     posterior, remainder, h = expanded(cloud, spacing(n, share / 2.2), log_cut)
     return posterior, certificate.expanded(remainder, cloud.axes, cloud.centre, poisson(n, h))
 
