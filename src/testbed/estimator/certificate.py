@@ -116,7 +116,7 @@ class Records:
 
     @cached_property
     def eta(self) -> Floats:
-        effects = 0.5 * np.sqrt((self.effects**2).sum(axis=2)).sum(axis=1)
+        effects = 0.5 * np.sqrt(np.einsum("rli,rli->rl", self.effects, self.effects)).sum(axis=1)
         return np.asarray(np.linalg.norm(self.pull, axis=1) + self.swing + effects)
 
     @property

@@ -106,7 +106,7 @@ class Cloud:
         """Logarithm of the weight of each hidden state that is possible, the largest 0."""
         self.logs = shares[self.states] - sums[:, None, None]
         """Logarithms of the components' shares of their hidden state's weight, (S', H, N)."""
-        squares = (self.places**2).sum(axis=2)
+        squares = np.einsum("hni,hni->hn", self.places, self.places)
         self.radii = np.sqrt(squares)
         self.spread = float((np.exp(self.logs) * squares).sum(axis=(1, 2)).max())
         """Largest second moment of the components of a hidden state."""
@@ -141,8 +141,8 @@ def expanded(cloud: Cloud, h: float, log_cut: float) -> tuple[Posterior, Remaind
     reach = np.sqrt(2.0 * SPLIT * np.maximum(room, 0.0))
     widest = np.where(used, reach, -np.inf).max(axis=0)
     some = np.isfinite(widest)
-    low = np.where(some[..., None], cloud.places - widest[..., None], np.inf).min(axis=(0, 1))
-    high = np.where(some[..., None], cloud.places + widest[..., None], -np.inf).max(axis=(0, 1))
+    places, around = cloud.places[some].T.copy(), widest[some]
+    low, high = (places - around).min(axis=1), (places + around).max(axis=1)
     h = _fitting(h, high - low)
     first = np.floor(low / h).astype(np.int64) - 1
     counts = np.ceil(high / h).astype(np.int64) + 2 - first
@@ -290,5 +290,5 @@ def _remainder(
     mean[states] = share @ places
     for state, weights in zip(states, share, strict=True):
         second[state] = (places * weights[:, None]).T @ places
-    furthest = math.sqrt(float((places**2).sum(axis=1).max()))
+    furthest = math.sqrt(float(np.einsum("ni,ni->n", places, places).max()))
     return Remainder(log_mass, edges, mean, second, furthest)
