@@ -489,7 +489,10 @@ def test_a_state_that_overflows_fails_the_run(tmp_path: Path) -> None:
         ({"estimators": [{"name": "aoe", "depth": 3}]}, "estimators.aoe: estimator 'aoe': unknown option 'depth'"),
         ({"estimators": [{"name": "kfio", "acks": "none"}]}, "estimators.kfio: kfio needs every ACK"),
         ({"estimators": [{"name": "kfio"}]}, "estimators.kfio: kfio needs every ACK"),
-        ({"estimators": [{"name": "oe", "acks": "none"}]}, "estimators.oe: oe enumerates 2^k histories"),
+        (
+            {"estimators": [{"name": "oe-exact", "acks": "none"}]},
+            "estimators.oe-exact: oe-exact enumerates 2^k histories",
+        ),
         ({"estimators": [{"name": "ff"}], "links": MARKOV_BOTH["links"]}, "estimators.ff: "),
     ],
 )
