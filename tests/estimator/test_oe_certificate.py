@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from dataclasses import replace
 
@@ -12,15 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from estimator.reference import gaussian
-from estimator.reference.cases import ACKS, ARRIVALS, CHAINS, Floats, Trial, check, random_system, random_trial
+from estimator.reference.cases import ACKS, ARRIVALS, HIDDEN, Floats, Trial, check, random_system, random_trial
 from estimator.reference.drive import acks_at, model_of, run
-from estimator.reference.stacked import Stack
-from testbed.channel.law import Law
 from testbed.channel.loss import Chain
 from testbed.estimator.model import Ack, Estimator, Model
 from testbed.estimator.packets import read_packets, replay
 from testbed.estimator.registry import create
 
+CHAINS = ("bernoulli", "markov", HIDDEN)
 ROUNDING = 1e-11
 EARLY = {"max_histories": 4, "tolerance": 1e-9}
 """Goes to the lattice at the third packet that is not acknowledged."""
@@ -241,37 +239,3 @@ def test_compiled_or_not_the_estimates_agree(chain: str, monkeypatch: pytest.Mon
     plain = run("oe", trial, EARLY)
     np.testing.assert_allclose(compiled[0], plain[0], rtol=0.0, atol=1e-12 * np.sqrt(np.abs(plain[1]).max()))
     np.testing.assert_allclose(compiled[1], plain[1], rtol=1e-12, atol=1e-12 * np.abs(plain[1]).max())
-
-
-def test_a_law_of_four_hidden_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A chain good/bad in which packets arrive with 0.9 and 0.3, against the sum over all its paths."""
-    channel, arrival, start = np.array([[0.8, 0.2], [0.4, 0.6]]), np.array([0.9, 0.3]), np.array([0.7, 0.3])
-    fate = np.stack([1.0 - arrival, arrival], axis=1)  # P(ν | channel state)
-    law = Law(
-        (start[:, None] * fate).ravel(),
-        np.repeat((channel[:, :, None] * fate[None]).reshape(2, 4), 2, axis=0),
-        np.array([False, True, False, True]),
-    )
-    monkeypatch.setattr("testbed.estimator.oe_exact.law_of", lambda _: law)
-    rng = np.random.default_rng(11)
-    trial = random_trial(rng, random_system(rng, 2, 1, 1), 8, 1, "late")
-    exact, fast = (run(kind, trial, options) for kind, options in (("oe-exact", {}), ("oe", EARLY)))
-    for k in range(1, trial.steps + 1):
-        u, y, arrived, known = trial.u[:k, 0], trial.y[:k, 0], trial.arrived[:k, 0], trial.known(k, 0)
-        histories, logs = [], []
-        for bits in itertools.product((0, 1), repeat=k):
-            forward = start * fate[:, bits[0]]
-            for bit in bits[1:]:
-                forward = (forward @ channel) * fate[:, bit]
-            if all(bits[j] == nu for j, nu in known.items()):
-                histories.append(bits)
-                logs.append(np.log(forward.sum()))
-        stack, all_histories = Stack(trial.system, arrived), np.array(histories, dtype=float)
-        weights = np.array(logs) + stack.log_densities(u, y, all_histories)
-        weights = np.exp(weights - weights.max())
-        reference = gaussian.mixture_moments(
-            weights / weights.sum(), stack.posterior_means(u, y, all_histories), stack.cov
-        )
-        for x_hat, P in (exact, fast):
-            of_mean, of_trace = errors(x_hat[k - 1, 0], P[k - 1, 0], reference)
-            assert max(of_mean, of_trace) < 1e-9

@@ -23,6 +23,9 @@ KINDS: list[tuple[str, dict[str, Any]]] = [
     ("gpb2", {}),
     ("imm", {}),
     ("pf", {"particles": 40}),
+    ("oe", {}),
+    ("oe", {"max_histories": 4}),
+    ("oe-exact", {}),
 ]
 
 

@@ -5,7 +5,6 @@ Enumeration is ``oe_exact``; re-expansion on a lattice is ``lattice``; the proof
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,8 +15,9 @@ from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.oe_exact import MAX_HISTORIES, Group, OeExact
 from testbed.estimator.posterior import Posterior
 from testbed.estimator.refiltering import Lane, Settings
+from testbed.estimator.state import State
 from testbed.numerics.lanes import Floats, matrices_of, matrix_of, vector_of
-from testbed.numerics.ragged import Arrays, packed, unpacked
+from testbed.numerics.ragged import packed, unpacked
 from testbed.scenario import Scenario
 
 ENUMERATED = {1: 4096, 2: 4096, 3: 512}
@@ -108,7 +108,7 @@ class Oe(OeExact):
             self._beyond[int(i)] = Lane(self._settings, posterior, P[i])
         return None
 
-    def state(self) -> Arrays:
+    def state(self) -> State:
         lanes, moments = [], []
         for i, lane in self._beyond.items():
             inputs, of_lane = lane.arrays()
@@ -116,10 +116,16 @@ class Oe(OeExact):
             moments += of_lane
         return {**super().state(), **packed("lane.", lanes), **packed("moment.", moments)}
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        super().set_state(state)
+    def _take(self, state: State) -> None:
+        super()._take(state)
         moments = iter(unpacked("moment.", state))
         self._beyond = {}
         for inputs in unpacked("lane.", state):
             i, count = (int(v) for v in inputs["lane"])
             self._beyond[i] = Lane.of(self._settings, inputs, [next(moments) for _ in range(count)])
+
+    def _consistent(self) -> bool:
+        return super()._consistent() and all(lane.consistent for lane in self._beyond.values())
+
+    def _elsewhere(self) -> list[int]:
+        return list(self._beyond)

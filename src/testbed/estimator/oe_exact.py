@@ -7,20 +7,20 @@ state, each history carries the law of it (the forward algorithm), so that their
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from annotated_types import Ge
 from numpy.typing import NDArray
 
-from testbed.channel.law import law_of
 from testbed.errors import UsageError
 from testbed.estimator.errors import ContradictoryAck, TooManyHistories
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.posterior import Fates
 from testbed.estimator.riccati import Gain, phi, predict
+from testbed.estimator.state import Given, State, start_of
 from testbed.numerics.lanes import (
     Cholesky,
     Component,
@@ -34,7 +34,7 @@ from testbed.numerics.lanes import (
     symmetric,
     vector_of,
 )
-from testbed.numerics.ragged import Arrays, packed, unpacked
+from testbed.numerics.ragged import packed, unpacked
 from testbed.scenario import Scenario
 
 MAX_HISTORIES = 65536
@@ -64,9 +64,12 @@ class Group:
 class OeExact:
     """The minimum mean square error estimator, exact, while 2^(undecided packets) ≤ ``max_histories``."""
 
+    STATE_VERSION: ClassVar[int] = 1
+    _name, _other = "oe-exact", "oe"
+
     def __init__(self, model: Model, lanes: int, max_histories: Annotated[int, Ge(1)] = MAX_HISTORIES) -> None:
         self._model, self._lanes, self._limit = model, lanes, max_histories
-        self._fates = Fates(law_of(model.control))
+        self._fates = Fates(model.law)
         self.counters: dict[str, int] = {}
         x_hat, P = np.tile(model.x0_mean, (lanes, 1)), np.tile(model.P0, (lanes, 1, 1))
         self.start_from(0, x_hat, P)
@@ -81,18 +84,17 @@ class OeExact:
                 f"or {self._other}"
             )
 
-    _name, _other = "oe-exact", "oe"
-
     def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
         """Begin behind ``step`` with N(x_hat, P), (M, n) and (M, n, n), in each lane, knowing of no loss before."""
+        _, covariance = start_of(step, x_hat, P, self._lanes, self._model.n)
         law = np.repeat(self._fates.at(step), self._lanes).reshape(-1, self._lanes, 1)
         means = [x_hat[:, i : i + 1].astype(np.float64) for i in range(self._model.n)]
         self._groups = [Group(np.arange(self._lanes), (), means, np.zeros((self._lanes, 1)), law)]
-        self._p = matrix_of(np.asarray(P, dtype=np.float64))
+        self._p = covariance
         self._k, self._first = step, step
 
-    def state(self) -> Arrays:
-        """All that the next step depends on."""
+    def state(self) -> State:
+        """k, the step of the start, P (M, n, n), and the groups: ``group.NAME`` and the shapes of each."""
         groups = [
             {
                 "lanes": group.lanes,
@@ -103,20 +105,47 @@ class OeExact:
             }
             for group in self._groups
         ]
-        return {
-            "k": np.array([self._k, self._first]),
-            "P": matrices_of(self._p, self._lanes),
-            **packed("group.", groups),
-        }
+        steps = {"k": np.array(self._k, dtype=np.int64), "first": np.array(self._first, dtype=np.int64)}
+        return {**steps, "P": matrices_of(self._p, self._lanes), **packed("group.", groups)}
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Go on where ``state`` was taken."""
-        self._k, self._first = (int(v) for v in state["k"])
-        self._p = matrix_of(state["P"])
+    def set_state(self, state: State) -> None:
+        """Raises UsageError, and changes nothing, for what is not the ``state`` of such an estimator."""
+        twin = copy.copy(self)
+        given = Given({name: state[name] for name in ("k", "P") if name in state}, self._lanes, self._model.n)
+        covariance = given.matrix("P")
+        for name, array in state.items():
+            if array.dtype not in (np.float64, np.int64) or not np.isfinite(array).all():
+                raise UsageError(f"state: {name!r} holds what is not a finite float64 or an int64")
+        try:
+            twin._k, twin._p, twin._first = given.step, covariance, int(state["first"])
+            twin._take(state)
+            again = twin.state() if twin._consistent() else {}
+        except (KeyError, ValueError, IndexError, TypeError, StopIteration) as error:
+            raise UsageError(f"state: not one of {self._name!r}: {' '.join(str(error).split())}") from None
+        if again.keys() != state.keys() or not all(_same(again[name], state[name]) for name in again):
+            raise UsageError(f"state: not one of {self._name!r} with this model, lanes and options")
+        vars(self).update(vars(twin))
+
+    def _take(self, state: State) -> None:
         self._groups = [
             Group(part["lanes"], tuple(part["undecided"].tolist()), list(part["means"]), part["scores"], part["hidden"])
             for part in unpacked("group.", state)
         ]
+
+    def _consistent(self) -> bool:
+        """Whether the shapes fit one another and each lane is in one place."""
+        n, states = self._model.n, self._fates.states
+        for group in self._groups:
+            size = len(group.lanes), 2 ** len(group.undecided)
+            shapes = [*(m.shape for m in group.means), group.scores.shape, *(h.shape for h in group.hidden)]
+            if len(group.means) != n or len(group.hidden) != states or set(shapes) != {size}:
+                return False
+        held = sorted(int(i) for group in self._groups for i in group.lanes)
+        return sorted([*held, *self._elsewhere()]) == list(range(self._lanes)) and 0 <= self._first <= self._k
+
+    def _elsewhere(self) -> list[int]:
+        """Lanes that no group holds."""
+        return []
 
     def step(self, u: Floats, y: Floats, arrived: NDArray[Any], acks: tuple[Ack, ...] = ()) -> Estimate:
         """Raises TooManyHistories where the number of hypotheses would pass the limit."""
@@ -251,6 +280,10 @@ class OeExact:
         between = matrix_of(spread)
         p = symmetric(self._model.n, lambda i, j: self._p[i][j] + between[i][j])
         return Estimate(vector_of(mean), p, self._lanes)
+
+
+def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    return a.dtype == b.dtype and a.shape == b.shape and bool(np.array_equal(a, b))
 
 
 def _interleave(a: Floats, b: Floats) -> Floats:

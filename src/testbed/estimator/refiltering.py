@@ -189,6 +189,24 @@ class Lane:
         }
         return inputs, [moment.arrays() for moment in (self.now, *self._checkpoints)]
 
+    @property
+    def consistent(self) -> bool:
+        """Whether the shapes of its moments fit the model and one another."""
+        n, states = self._settings.model.n, self._settings.fates.states
+        none = Records.none(n, states).arrays()
+        for moment in (self.now, *self._checkpoints):
+            post, size = moment.posterior, (2 ** len(moment.posterior.undecided), len(moment.posterior.nodes))
+            found = post.centre.shape, post.basis.shape, post.covariance.shape, post.nodes.shape[1:], post.offsets.shape
+            if found != ((n,), (n, n), (n, n), (n,), (size[0], n)):
+                return False
+            if post.weights.shape != (states, *size) or post.scores.shape != size:
+                return False
+            records = moment.certificate.records.arrays()
+            count = {len(array) for array in records.values()}
+            if len(count) != 1 or any(records[name].shape[1:] != none[name].shape[1:] for name in none):
+                return False
+        return True
+
     @classmethod
     def of(cls, settings: Settings, inputs: Arrays, moments: list[Arrays]) -> Lane:
         lane = object.__new__(cls)

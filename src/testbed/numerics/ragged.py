@@ -1,4 +1,7 @@
-"""Arrays of different shapes as flat ones, with what it takes to cut them apart again."""
+"""Arrays of different shapes as flat ones, with what it takes to cut them apart again.
+
+An infinite value is kept as the largest number, so that all that is packed is finite.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Arrays = dict[str, NDArray[Any]]
+_LARGEST = np.finfo(np.float64).max
 
 
 def packed(prefix: str, parts: Sequence[Mapping[str, NDArray[Any]]]) -> Arrays:
@@ -16,7 +20,8 @@ def packed(prefix: str, parts: Sequence[Mapping[str, NDArray[Any]]]) -> Arrays:
     out: Arrays = {f"{prefix}count": np.array(len(parts))}
     for name in parts[0] if parts else ():
         arrays = [np.asarray(part[name]) for part in parts]
-        out[f"{prefix}{name}"] = np.concatenate([array.ravel() for array in arrays])
+        flat = np.concatenate([array.ravel() for array in arrays])
+        out[f"{prefix}{name}"] = np.clip(flat, -_LARGEST, _LARGEST) if flat.dtype == np.float64 else flat
         out[f"{prefix}{name}.shape"] = np.array([array.shape for array in arrays], dtype=np.int64).reshape(
             len(parts), -1
         )
@@ -34,5 +39,11 @@ def unpacked(prefix: str, state: Mapping[str, NDArray[Any]]) -> list[Arrays]:
         ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
         pieces = np.split(state[key], ends[:-1])
         for part, piece, shape in zip(parts, pieces, shapes, strict=True):
-            part[name] = piece.reshape(shape).copy()
+            part[name] = _with_infinities(piece.reshape(shape).copy())
     return parts
+
+
+def _with_infinities(array: NDArray[Any]) -> NDArray[Any]:
+    if array.dtype == np.float64:
+        array[array == _LARGEST], array[array == -_LARGEST] = np.inf, -np.inf
+    return array
