@@ -20,7 +20,7 @@ from testbed.estimator.posterior import Fates, Posterior, decided, predicted, up
 from testbed.numerics.lanes import Floats
 from testbed.numerics.ragged import Arrays
 
-BRANCHES = 4
+BRANCHES = 8
 """Histories since the last re-expansion at which the next one is due."""
 LEFT_OUT_MAX = 1e-3
 """Share of the tolerance from which what was left out is too much."""
