@@ -111,7 +111,7 @@ class Ack:
     known: NDArray[Any]
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Estimate:
     """x_hat (M, n) and P (M, n, n) at one step, from components."""
 

@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from testbed.wire.bundle import unbundle
 from testbed.wire.messages import PROTOCOL, ArrayEntry, Message, Packet
@@ -90,7 +90,7 @@ class PacketEncoder:
 
     def encode(self, seq: int, step: int, lane: int, lanes: int, arrays: Arrays) -> bytes:
         """The payload of one packet; arrays: float64 or uint8."""
-        numbers = b'%12d,"step":%12d' % (seq, step)
+        numbers = _text(seq, step)
         form = (len(numbers), lane, lanes, *[(name, array.shape, array.dtype) for name, array in arrays.items()])
         parts = self._parts.get(form)
         if parts is None:
@@ -120,6 +120,11 @@ def _contents(arrays: Arrays) -> list[bytes | memoryview]:
         if size % 8:
             pieces.append(_PADDING[size % 8])
     return pieces
+
+
+def _text(seq: int, step: int) -> bytes:
+    """How PacketEncoder writes the numbers."""
+    return b'%12d,"step":%12d' % (seq, step)
 
 
 @dataclass(frozen=True)
@@ -168,17 +173,37 @@ class _Recent:
         match = _NUMBERS.fullmatch(message, len(self.head), self.tail_at)
         return None if match is None else (int(match[1]), int(match[2]))
 
+    def numbers_of(self, messages: list[bytes]) -> list[tuple[int, int] | None]:
+        """``numbers`` of each: most often both are one more than in the message before."""
+        out: list[tuple[int, int] | None] = []
+        seq, step = self.numbers(messages[0]) or (0, 0)
+        tail, tail_at = self.tail, self.tail_at
+        for message in messages:
+            expected = self.head + _text(seq, step)
+            if message.startswith(expected) and len(expected) == tail_at and message.startswith(tail, tail_at):
+                out.append((seq, step))
+            else:
+                found = self.numbers(message)
+                out.append(found)
+                seq, step = found or (seq, step)
+            seq, step = seq + 1, step + 1
+        return out
 
-_set = object.__setattr__
+
+_new = object.__new__
+_slots = vars(BaseModel)
+_set_values, _set_named = _slots["__dict__"].__set__, _slots["__pydantic_fields_set__"].__set__
+_set_extra, _set_private = _slots["__pydantic_extra__"].__set__, _slots["__pydantic_private__"].__set__
 
 
 def _variant(header: Any, seq: int, step: int, lane: int) -> Any:
     """A valid header with other numbers, which the caller has checked; model_copy takes ten times as long."""
-    out = object.__new__(type(header))
-    _set(out, "__dict__", {**header.__dict__, "seq": seq, "step": step, "lane": lane})
-    _set(out, "__pydantic_fields_set__", header.__pydantic_fields_set__)
-    _set(out, "__pydantic_extra__", None)
-    _set(out, "__pydantic_private__", None)
+    out, values = _new(type(header)), header.__dict__.copy()
+    values["seq"], values["step"], values["lane"] = seq, step, lane
+    _set_values(out, values)
+    _set_named(out, header.__pydantic_fields_set__)
+    _set_extra(out, None)
+    _set_private(out, None)
     return out
 
 
@@ -278,7 +303,7 @@ class Decoder(Generic[M]):
         if recent is None or not recent.form.layout.slots or size != recent.end + recent.form.layout.size:
             return None
         like, layout = recent.form.header, recent.form.layout
-        numbers = [recent.numbers(message) for message in messages]
+        numbers = recent.numbers_of(messages)
         first, last = like.FIRST_STEP, like.FIRST_STEP + self._sizes.steps - 1
         if not all(pair is not None and first <= pair[1] <= last for pair in numbers):
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import queue
 import threading
 import time
@@ -156,8 +157,12 @@ class ZenohBus:
 
     def _at_once(self, handle: Callable[..., None]) -> Any:
         inbox, lock = self._inbox, self._lock
+        known: set[int] = set()
 
         def take(event: Any) -> None:
+            if threading.get_ident() not in known:
+                known.add(threading.get_ident())
+                _keep_thread_state()
             with lock:
                 if self._failed:
                     return
@@ -179,6 +184,11 @@ class ZenohBus:
             inbox.put((handle, event))
 
         return zenoh.handlers.Callback(put, indirect=False)
+
+
+def _keep_thread_state() -> None:
+    """Of a thread that is not Python's: it would be made and freed in every call, and with it memory be mapped."""
+    ctypes.pythonapi.PyGILState_Ensure()
 
 
 def _raise(error: Exception) -> None:
