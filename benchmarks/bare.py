@@ -43,13 +43,15 @@ class Relay:
 class Star:
     """Source → relays → source. The first relay makes single steps of a grant, as the controller does.
 
-    ends: the key that completes a step at the source; hears: the others it must receive.
+    ends: the key that completes a step at the source; hears: the others it must receive. ring: what ends a step begins
+    the next one at the first relay, and the source only starts the first and listens.
     """
 
     grant: tuple[str, int]
     relays: tuple[Relay, ...]
     ends: str
     hears: tuple[str, ...] = ()
+    ring: bool = False
 
 
 def star_of(sizes: dict[str, int], *, whole: bool) -> Star:
@@ -74,6 +76,13 @@ def star_of(sizes: dict[str, int], *, whole: bool) -> Star:
         "estimate",
         ("truth",) * whole,
     )
+
+
+def ring_of(sizes: dict[str, int]) -> Star:
+    """controller → link.control → plant → link.observation → estimator → controller: five hops, all between clients."""
+    chain = star_of(sizes, whole=False)
+    controller = Relay("controller", chain.ends, chain.relays[0].says)
+    return Star((chain.ends, sizes[chain.ends]), (controller, *chain.relays[1:]), chain.ends, ring=True)
 
 
 def message_sizes(n: int, p: int, q: int, lanes: int) -> dict[str, int]:
@@ -117,6 +126,7 @@ def _as_json(star: Star) -> dict[str, Any]:
         "relays": [vars(relay) for relay in star.relays],
         "ends": star.ends,
         "hears": star.hears,
+        "ring": star.ring,
     }
 
 
@@ -163,7 +173,8 @@ def _number(sample: Any) -> int:
     return int.from_bytes(sample.payload.to_bytes()[:8], "little")
 
 
-def _relay(endpoint: str, relay: Relay, *, express: bool, expand: bool) -> None:
+def _relay(endpoint: str, relay: Relay, *, express: bool, expand: bool, ahead: bool) -> None:
+    """expand: a number stands for all steps up to it; ahead: the step after it is what follows."""
     with _open("client", endpoint) as session:
         for key in relay.hears:
             _drain(session, key)
@@ -173,7 +184,7 @@ def _relay(endpoint: str, relay: Relay, *, express: bool, expand: bool) -> None:
         last = 0
         while stop.empty():
             try:
-                number = _number(inbox.get(timeout=0.5))
+                number = _number(inbox.get(timeout=0.5)) + ahead
             except queue.Empty:
                 continue
             assert expand or number == last + 1, f"{relay.name}: {number} after {last}"
@@ -198,13 +209,16 @@ def _source(star: Star, steps: int, window: int, express: bool, lanes: int) -> R
         put = _putter(session, star.grant[0], express=express)
         workers = []
         for i, relay in enumerate(star.relays):
-            request = json.dumps({"relay": vars(relay), "express": express, "expand": i == 0})
+            first = i == 0
+            own = {"express": express, "expand": first and not star.ring, "ahead": first and star.ring}
+            request = json.dumps({"relay": vars(relay), **own})
             command = [sys.executable, "-m", "benchmarks.bare", "relay", request, "--connect", endpoint]
             workers.append(subprocess.Popen(command))
         try:
             for _ in workers:
                 ready.get(timeout=60)
-            return _drive(put, star.grant[1], inbox, steps, window, lanes, [relay.name for relay in star.relays])
+            names = [relay.name for relay in star.relays]
+            return _drive(put, star.grant[1], inbox, steps, window, lanes, names, ring=star.ring)
         finally:
             session.put(f"{ROOT}/stop", b"")
             for worker in workers:
@@ -222,11 +236,17 @@ def _drive(
     window: int,
     lanes: int,
     names: list[str],
+    *,
+    ring: bool,
 ) -> Result:
-    """Grant as the testbed's clock does: a quarter of the window at a time."""
+    """Grant as the testbed's clock does: a quarter of the window at a time. A ring is started, and left alone."""
     filler, granted, completed = b"\0" * (size - 8), 0, 0
     processes = {os.getpid(): "source", **dict(zip(children_of(os.getpid()), names, strict=True))}
     before, busy, begun = usage_of(processes), Busy(), time.perf_counter()
+    if ring:
+        put((0).to_bytes(8, "little") + filler)
+        assert _number(inbox.get(timeout=30)) == 0
+        granted = steps
     while completed < steps:
         target = min(steps, completed + window)
         if target > granted and (target == steps or target - granted >= max(1, window // 4)):
@@ -252,10 +272,12 @@ def main() -> int:
     given = options.parse_args()
     request = given.request
     if given.what == "relay":
-        _relay(given.connect, _relay_from(request["relay"]), express=request["express"], expand=request["expand"])
+        own = {name: request[name] for name in ("express", "expand", "ahead")}
+        _relay(given.connect, _relay_from(request["relay"]), **own)
         return 0
     parts = request["star"]
-    star = Star(tuple(parts["grant"]), tuple(map(_relay_from, parts["relays"])), parts["ends"], tuple(parts["hears"]))
+    relays = tuple(map(_relay_from, parts["relays"]))
+    star = Star(tuple(parts["grant"]), relays, parts["ends"], tuple(parts["hears"]), parts["ring"])
     print(json.dumps(vars(_source(star, request["steps"], request["window"], request["express"], request["lanes"]))))
     return 0
 

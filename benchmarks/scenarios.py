@@ -29,12 +29,29 @@ loss = { kind = "markov", recovery = 0.6, failure = 0.2 }
 name = "aoe"
 """
 
+_CLOSED = (
+    _TEXT[: _TEXT.index("[input]")]
+    + """
+[input]
+kind = "feedback"
+gain = [[0.01, 0.02]]
+estimator = "aoe"
+"""
+    + _TEXT[_TEXT.index("[links.control]") :]
+)
+
 
 def scenario(
-    *, steps: int, lanes: int = 1, window: int | None = None, bounds: bool = False, record: str = "none"
+    *,
+    steps: int,
+    lanes: int = 1,
+    window: int | None = None,
+    bounds: bool = False,
+    record: str = "none",
+    closed: bool = False,
 ) -> Scenario:
-    """The benchmark scenario of that size; ``window`` None: as the testbed chooses."""
-    base: Scenario = parse_scenario(_TEXT)
+    """The benchmark scenario of that size; ``window`` None: as the testbed chooses; closed: u follows the estimate."""
+    base: Scenario = parse_scenario(_CLOSED if closed else _TEXT)
     changed = {"steps": steps, "lanes": lanes, "bounds": bounds, "record": record}
     clock = base.clock.model_copy(update={"window": window})
     return base.model_copy(update={**changed, "clock": clock})

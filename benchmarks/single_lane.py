@@ -1,4 +1,4 @@
-"""One lane at a window: the testbed without and with a recording, beside the bare chain. Shared by two benchmarks."""
+"""One lane at a window: the testbed without and with a recording, beside the bare chain."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.testbed_run import run_testbed
 def measure(name: str, *, window: int, quick: bool) -> tuple[Figures, Median, Median]:
     """The figures, the steps/s of the testbed without a recording, and their ratio to the bare chain's."""
     repetitions, seconds = (2, 1.0) if quick else (5, 3.0)
-    steps = _enough(run_testbed(scenario(steps=600, window=window)), seconds)
+    steps = enough(run_testbed(scenario(steps=600, window=window)), seconds)
     sizes = message_sizes(n=2, p=2, q=1, lanes=1)
 
     def ours(record: str) -> Any:
@@ -23,7 +23,7 @@ def measure(name: str, *, window: int, quick: bool) -> tuple[Figures, Median, Me
         star = star_of(sizes, whole=whole)
         return lambda: run_bare(star, steps=steps, window=window, express=window == 1)
 
-    bare_steps = _enough(bare(2000, whole=False)(), seconds)
+    bare_steps = enough(bare(2000, whole=False)(), seconds)
     cases = {
         "testbed, record none": ours("none"),
         "testbed, record first": ours("first"),
@@ -51,6 +51,6 @@ def measure(name: str, *, window: int, quick: bool) -> tuple[Figures, Median, Me
     return figures, Median.of(rates), ratios(rates, chain)
 
 
-def _enough(pilot: Any, seconds: float) -> int:
+def enough(pilot: Any, seconds: float) -> int:
     """Steps that take about ``seconds`` at the rate of the pilot."""
     return max(500, round(pilot.steps_per_s * seconds / 100) * 100)
