@@ -71,9 +71,9 @@ def run_floor(scenario: Scenario) -> Floor:
                 lower, upper = bounds.components(bits(arrived))
                 traces = {"lower": trace(lower), **({} if upper is None else {"upper": trace(upper)})}
                 spent("bounds")
-                bound_series.add(k, traces)
+                bound_series.add(k, 0, traces)
                 bound_series.close(k)
-            series.add(k, error_figures(plant.x, estimate.x, estimate.p))
+            series.add(k, 0, error_figures(plant.x, estimate.x, estimate.p))
             series.close(k)
             spent("orchestrator")
     assert array_of(plant.x, lanes).shape == (lanes, model.n)
