@@ -13,7 +13,7 @@ from testbed.wire.codec import Sizes
 from testbed.wire.node import Node
 
 _WINDOW_MAX = 256
-_BYTES_IN_FLIGHT = 4_000_000
+_BYTES_IN_FLIGHT = 24_000_000
 _CLOSED_LOOP_CREDIT = 64  # steps
 _DIRECT_MAX = 8_192  # bytes
 _SHARED_MIN = 65_536  # bytes of the largest packet from which shared memory pays
