@@ -161,7 +161,7 @@ def updated() -> Filter:
         (lambda: Filter("aoe", MODEL).update([1.0]), "update: there is no step yet; allowed: predict first"),
         (lambda: updated().update([1.0]), "update: step 1 is updated already; allowed: predict first"),
         (lambda: Filter("aoe", MODEL).predict([1.0, 2.0]), "u: got shape (2,); allowed: (1,)"),
-        (lambda: Filter("aoe", MODEL).predict(), "u: got None; allowed: (1,) numbers"),
+        (lambda: Filter("aoe", MODEL).predict(), "u: got shape (0,); allowed: (1,)"),
         (lambda: Filter("aoe", MODEL).predict(["a"]), "u: got ['a']; allowed: (1,) numbers"),
         (lambda: Filter("aoe", MODEL).predict([np.inf]), "u: got a value that is not finite; allowed: numbers"),
         (lambda: Filter("aoe", MODEL, 2).predict([1.0, 2.0]), "u: got shape (2,); allowed: (2, 1)"),

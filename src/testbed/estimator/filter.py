@@ -150,7 +150,7 @@ class Filter:
     def _array(self, name: str, values: Any, size: int, mask: NDArray[np.bool_] | None = None) -> Floats:
         """Values as (M, size); 0 in the lanes that a mask leaves out."""
         try:
-            array = np.array(values, dtype=np.float64)
+            array = np.array(() if values is None else values, dtype=np.float64)
         except (TypeError, ValueError):
             raise UsageError(f"{name}: got {values!r}; allowed: {self._allowed(size)} numbers") from None
         if self._lanes == 1 and array.ndim < 2 and array.size == size:

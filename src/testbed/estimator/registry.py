@@ -20,7 +20,7 @@ from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.model import Estimator, Model
 from testbed.scenario import EstimatorSpec, Scenario
 
-_BUILT_IN = {
+BUILT_IN = {
     "aoe": "testbed.estimator.aoe:Aoe",
     "ff": "testbed.estimator.ff:Ff",
     "gpb": "testbed.estimator.gpb:Gpb",
@@ -42,7 +42,7 @@ GROUP = "testbed.estimators"
 
 def kinds() -> list[str]:
     """All names that ``create`` knows."""
-    return sorted({*_BUILT_IN, *(point.name for point in entry_points(group=GROUP))})
+    return sorted({*BUILT_IN, *(point.name for point in entry_points(group=GROUP))})
 
 
 def create(
@@ -65,7 +65,7 @@ def create(
 def kind_of(estimator: Estimator) -> str:
     """The name of a built-in estimator, MODULE:CLASS of another."""
     path = f"{type(estimator).__module__}:{type(estimator).__qualname__}"
-    return next((kind for kind, known in _BUILT_IN.items() if known == path), path)
+    return next((kind for kind, known in BUILT_IN.items() if known == path), path)
 
 
 def check(spec: EstimatorSpec, model: Model, *, acks: str, scenario: Scenario) -> None:
@@ -107,8 +107,8 @@ def model_of(scenario: Scenario) -> Model:
 
 
 def _factory(kind: str) -> Callable[..., Estimator]:
-    if kind in _BUILT_IN:
-        module, name = _BUILT_IN[kind].split(":")
+    if kind in BUILT_IN:
+        module, name = BUILT_IN[kind].split(":")
         found: Callable[..., Estimator] = getattr(import_module(module), name)
         return found
     for point in entry_points(group=GROUP, name=kind):
