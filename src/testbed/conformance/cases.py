@@ -131,7 +131,8 @@ def _losses(rng: np.random.Generator, chain: Chain, steps: int, lanes: int) -> N
 
 def _normal(rng: np.random.Generator, covariance: Floats, shape: tuple[int, ...]) -> Floats:
     values, vectors = np.linalg.eigh(covariance)
-    return rng.normal(size=(*shape, len(values))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(rng.normal(size=(*shape, len(values))) @ root.T)
 
 
 def _symmetric(S: Floats) -> Floats:

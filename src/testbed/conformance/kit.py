@@ -14,7 +14,7 @@ from testbed.conformance.subject import Subject
 from testbed.errors import did_you_mean
 
 Check = Callable[[Subject], str]
-"""Its docstring says what it wants. It returns what it found, or raises Failed or Skipped; anything else is a failure."""
+"""Its docstring says what it wants. It returns what it found, or raises Failed or Skipped; all else is a failure."""
 
 CLAIMS: tuple[Check, ...] = (
     theory.coordinates,
@@ -36,7 +36,8 @@ def declaration(subject: Subject) -> str:
             raise Failed(f"not_claimed: {name!r} has no reason")
     losses = "i.i.d. control losses only" if subject.control.independent else "Markov control losses"
     acks = "needs every ACK" if subject.delays else "needs no ACK"
-    return f"{losses}; {acks}; {len(declared)} not claimed"
+    refused = "".join(f"; refuses {name}" for name in subject.refused)
+    return f"{losses}; {acks}{refused}; {len(declared)} not claimed"
 
 
 CHECKS: tuple[Check, ...] = (

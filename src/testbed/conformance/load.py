@@ -24,9 +24,8 @@ def subject_of(name: str, options: Mapping[str, Any]) -> Subject:
         module, _, path = name.partition(":")
         return Subject(name, _object(name, module, path), options)
     if name not in kinds():
-        raise UsageError(
-            f"{name}: no such estimator; allowed: MODULE:OBJECT, or {', '.join(kinds())}{did_you_mean(name, kinds())}"
-        )
+        listed = ", ".join(kinds())
+        raise UsageError(f"{name}: no such estimator; allowed: MODULE:OBJECT, or {listed}{did_you_mean(name, kinds())}")
 
     def registered(model: Any, lanes: int, **given: Any) -> Any:
         return create(name, model, lanes=lanes, options=given)

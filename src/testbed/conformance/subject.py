@@ -12,7 +12,7 @@ import numpy as np
 from testbed.channel.loss import Chain
 from testbed.conformance.cases import BERNOULLI, MARKOV, Case, one, simulated, three, two
 from testbed.conformance.result import Failed
-from testbed.errors import TestbedError, UsageError
+from testbed.errors import UsageError
 from testbed.estimator.errors import MissingAck
 from testbed.estimator.model import Estimator
 from testbed.numerics.lanes import Floats
@@ -94,7 +94,24 @@ class Subject:
 
     @cached_property
     def cases(self) -> list[Case]:
-        """Three systems, one of one lane."""
+        """Of three systems those that the estimator takes; the first has one lane."""
+        return [case for case in self._all_cases if case.name not in self.refused]
+
+    @cached_property
+    def refused(self) -> dict[str, str]:
+        """The systems that the estimator refuses, by name, with what it says. Raises UsageError where it takes none."""
+        refused = {}
+        for case in self._all_cases:
+            try:
+                self.make(case)
+            except UsageError as error:
+                refused[case.name] = str(error)
+                if len(refused) == len(self._all_cases):
+                    raise
+        return refused
+
+    @cached_property
+    def _all_cases(self) -> list[Case]:
         return [
             simulated("n = 1", one(self.control), steps=STEPS, lanes=1, seed=1),
             simulated("n = 2", two(self.control), steps=STEPS, lanes=3, seed=2),
@@ -117,15 +134,6 @@ class Subject:
             inputs = case.u[k - 1].copy(), case.y[k - 1].copy(), case.arrived[k - 1].copy()
             outputs.append(estimator.step(*inputs, case.acks(k, delays)))
         return Run(case, outputs)
-
-    def run_long(self, case: Case) -> tuple[Run, str]:
-        """With ``delays``; with every ACK in time where the estimator says that it cannot go so far without."""
-        try:
-            return self.run(case), "every ACK" if self.delays else "no ACK"
-        except TestbedError as error:
-            if self.delays:
-                raise
-            return self.run(case, IN_TIME), f"every ACK, since without {type(error).__name__}"
 
     def _probe(self, control: Chain) -> Case:
         return simulated("n = 1", one(control), steps=1, lanes=1, seed=1)
