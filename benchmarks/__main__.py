@@ -9,10 +9,16 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import codec, lanes, lockstep, streaming
+from benchmarks import codec, estimators, lanes, lockstep, streaming
 from benchmarks.figures import machine
 
-BENCHMARKS = {"codec": codec.run, "lockstep": lockstep.run, "streaming": streaming.run, "lanes": lanes.run}
+BENCHMARKS = {
+    "codec": codec.run,
+    "lockstep": lockstep.run,
+    "streaming": streaming.run,
+    "lanes": lanes.run,
+    "estimators": estimators.run,
+}
 
 
 def main() -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import statistics
@@ -54,11 +55,13 @@ class Figures:
     rows: list[dict[str, Any]] = field(default_factory=list)
     targets: list[Target] = field(default_factory=list)
     cpu: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    """Further tables by title."""
     notes: list[str] = field(default_factory=list)
 
     def print(self, console: Console) -> None:
         console.print(_table(self.name, self.rows))
-        for title, rows in self.cpu.items():
+        for title, rows in (*self.tables.items(), *self.cpu.items()):
             console.print(_table(f"{self.name}: {title}", rows))
         for note in self.notes:
             console.print(f"  {note}", highlight=False)
@@ -69,9 +72,15 @@ class Figures:
         console.print()
 
     def to_json(self) -> dict[str, Any]:
-        rows = [{k: asdict(v) if isinstance(v, Median) else v for k, v in row.items()} for row in self.rows]
+        rows, tables = _plain(self.rows), {title: _plain(rows) for title, rows in self.tables.items()}
         targets = [{**asdict(target), "met": target.met} for target in self.targets]
-        return {"rows": rows, "targets": targets, "cpu": self.cpu, "notes": self.notes}
+        for target in targets:
+            target["value"] = target["value"] if math.isfinite(target["value"]) else None
+        return {"rows": rows, "tables": tables, "targets": targets, "cpu": self.cpu, "notes": self.notes}
+
+
+def _plain(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{k: asdict(v) if isinstance(v, Median) else v for k, v in row.items()} for row in rows]
 
 
 def alternate(repetitions: int, cases: dict[str, Callable[[], Any]]) -> dict[str, list[Any]]:

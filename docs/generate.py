@@ -44,6 +44,7 @@ SCENARIO_TABLES = (
     ("NoLoss", '`loss = { kind = "none" }`', ""),
     ("BernoulliLoss", '`loss = { kind = "bernoulli", … }`', ""),
     ("MarkovLoss", '`loss = { kind = "markov", … }`', ""),
+    ("GilbertElliottLoss", '`loss = { kind = "gilbert-elliott", … }`', ""),
     ("EstimatorSpec", "`[[estimators]]`", ""),
     ("Clock", "`[clock]`", ""),
     ("Transport", "`[transport]`", ""),
@@ -286,11 +287,13 @@ def _estimators() -> str:
     rows = []
     for kind in kinds():
         try:
-            made = getattr(import_module(f"testbed.estimator.{kind}"), kind.capitalize())
+            module = import_module(f"testbed.estimator.{kind.replace('-', '_')}")
+            made = getattr(module, "".join(part.capitalize() for part in kind.split("-")))
         except ImportError:  # of another package
             continue
         options = [
-            f"`{p.name} = {json.dumps(p.default)}`" for p in list(inspect.signature(made).parameters.values())[2:]
+            f"`{p.name}`" if p.default is None else f"`{p.name} = {json.dumps(p.default)}`"
+            for p in list(inspect.signature(made).parameters.values())[2:]
         ]
         text = _one_line((inspect.getdoc(import_module(made.__module__)) or "").split("\n\n")[0])
         rows.append((f"`{kind}`", text, ", ".join(options) or "–"))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from testbed.analysis.verdicts import analyze, vanishing_input
+from testbed.analysis.verdicts import analyze
 from testbed.scenario import parse_scenario
 
 M = {"A": [[1.2910, 0.0], [0.0, 1.005]], "C": [[1.0, -1.0], [0.0, 1.0]], "Q": [[20.0, 0.0], [0.0, 20.0]]}
@@ -66,6 +66,70 @@ def of(found: dict[str, Any], key: str) -> tuple[bool | None, str]:
 def test_observation_losses(system: dict[str, Any], loss: dict[str, Any] | None, expected: Any) -> None:
     verdict = of(figures(system, loss), "observation")
     assert verdict == (expected if isinstance(expected, tuple) else (True, expected))
+
+
+def hidden(to_bad: float, to_good: float, loss_good: float = 0.0, loss_bad: float = 1.0) -> dict[str, Any]:
+    return {
+        "kind": "gilbert-elliott",
+        "to_bad": to_bad,
+        "to_good": to_good,
+        "loss_good": loss_good,
+        "loss_bad": loss_bad,
+    }
+
+
+P3_C2 = {**P3, "C": [[1.0, 0.0], [0.0, 1.0]], "R": P3["Q"]}
+
+
+@pytest.mark.parametrize(
+    ("system", "loss", "expected"),
+    [
+        (SCALAR, hidden(0.1, 0.2, 0.1, 0.7), (False, "bursts")),
+        (SCALAR, hidden(0.1, 0.5, 0.1, 0.7), (True, "bursts")),
+        (P3_C2, hidden(0.1, 0.5, 0.1, 0.7), (True, "bursts")),
+        (P3, hidden(0.1, 0.5, 0.1, 0.7), (True, "domination, M Theorem 5")),
+        (P3, hidden(0.9, 0.9, 0.1, 0.5), (True, "domination, M Theorem 5")),
+        (P3, hidden(0.9, 0.9, 0.1, 0.9), (None, "none")),
+        (P3, hidden(0.1, 0.2, 0.1, 0.9), (False, "bursts")),
+        (ROTATION, hidden(0.1, 0.3, 0.05, 0.2), (True, "domination, Sinopoli upper bound")),
+        (ROTATION, hidden(0.1, 0.3, 0.05, 0.6), (None, "none")),
+        ({**P3, "A": [[0.9, 0.0], [0.0, 0.2]], "C": [[0.0, 0.0]]}, hidden(0.1, 0.2, 0.1, 0.9), (True, "ρ(A) < 1")),
+    ],
+)
+def test_observation_losses_with_a_hidden_state(system: dict[str, Any], loss: dict[str, Any], expected: Any) -> None:
+    found = figures(system, loss)
+    assert of(found, "observation") == expected
+    assert found["peak"]["stable"] is None
+    assert json.dumps(found, allow_nan=False)
+
+
+@pytest.mark.parametrize("system", [M, SCALAR, P3, ROTATION])
+@pytest.mark.parametrize(("recovery", "failure"), [(0.3, 0.2), (0.65, 0.03), (0.8, 0.3)])
+def test_a_hidden_state_that_is_the_fate_has_the_verdicts_of_the_chain(
+    system: dict[str, Any], recovery: float, failure: float
+) -> None:
+    links = {"links": {"control": {"loss": markov(recovery, failure)}}} if "B" in system else {}
+    chain = figures(system, markov(recovery, failure), **links)
+    same = figures(system, hidden(failure, recovery), **links)
+    assert {**same, "observation": {**same["observation"], "kind": "markov"}} == chain
+
+
+@pytest.mark.parametrize(("to_good", "finite"), [(0.5, True), (0.05, False)])
+def test_moments_with_a_hidden_state(to_good: float, finite: bool) -> None:
+    """The tail of P(m losses in a row), summed with the growth of the covariance: P_m = a² P_{m−1} + q."""
+    loss = hidden(0.1, to_good, 0.1, 0.75)
+    found = figures({**SCALAR, "A": [[1.2]]}, loss)
+    assert (found["moments"]["finite_mean"], found["moments"]["finite_variance"]) == (finite, finite)
+    block = np.array([[0.9 * 0.1, 0.1 * 0.75], [to_good * 0.1, (1 - to_good) * 0.75]])
+    tails = [np.linalg.matrix_power(block, m).sum(axis=1).max() * 1.2 ** (4 * m) for m in (40, 80)]
+    assert (tails[1] < tails[0]) == finite
+
+
+def test_control_losses_with_a_hidden_state() -> None:
+    links = {"control": {"loss": hidden(0.1, 0.5, 0.1, 0.7)}}
+    assert of(figures(M, markov(0.41), links=links), "control") == (True, "S, correlated")
+    alternating = {"control": {"loss": hidden(1.0, 1.0, 0.1, 0.7)}}
+    assert of(figures(M, markov(0.41), links=alternating), "control") == (None, "S, correlated")
 
 
 def expected_trace(system: dict[str, Any], recovery: float, failure: float, steps: int) -> float:
@@ -156,31 +220,6 @@ def test_noise_enters_through_g() -> None:
     assert found["uncontrollable_eigenvalues"] == [[pytest.approx(1.2), 0.0]]
 
 
-@pytest.mark.parametrize(
-    ("source", "vanishes"),
-    [
-        ({"kind": "exponential", "amplitude": 10.0, "tau": 30.0}, True),
-        ({"kind": "exponential", "offset": 1.0, "tau": 30.0}, False),
-        ({"kind": "constant", "value": [0.0]}, True),
-        ({"kind": "constant", "value": [1.0]}, False),
-        ({"kind": "sine", "period": 20}, False),
-        ({"kind": "sine", "period": 20, "amplitude": 0.0}, True),
-        ({"kind": "uniform", "low": -1.0, "high": 1.0}, False),
-        ({"kind": "uniform", "low": 0.0, "high": 0.0}, True),
-        ({"kind": "table", "values": [[0.0]] * 100}, None),
-        ({"kind": "feedback", "gain": [[0.1, 0.1]]}, None),
-        (None, True),
-    ],
-)
-def test_convergence(source: dict[str, Any] | None, vanishes: bool | None) -> None:
-    rest: dict[str, Any] = {"input": source} if source else {}
-    scenario = parse_scenario({"system": M, "estimators": [{"name": "aoe"}], **rest})
-    assert vanishing_input(scenario.input)[0] is vanishes
-    assert analyze(scenario)["convergence"]["holds"] is (True if vanishes else None)
-    lossy = figures(M, bernoulli(0.9), estimators=[{"name": "aoe"}], **rest)
-    assert lossy["convergence"]["holds"] is None
-
-
 @settings(deadline=None, max_examples=60)
 @given(
     st.integers(0, 2**32 - 1),
@@ -195,7 +234,11 @@ def test_any_scenario_gives_json(seed: int, n: int, p: int, scale: float, recove
     A = rng.integers(-2, 3, (n, n)) * scale
     system = {"A": A.tolist(), "C": rng.integers(-1, 2, (p, n)).tolist()}
     system |= {"Q": np.diag(rng.integers(0, 2, n)).tolist(), "R": np.eye(p).tolist()}
-    found = figures(system, markov(recovery, failure))
+    rest: dict[str, Any] = {}
+    if seed % 3 == 0:
+        rest["uncertainty"] = {"dA": (rng.integers(-1, 2, (2, n, n)) * scale).tolist(), "delta": 1.0}
+    found = figures(system, markov(recovery, failure), **rest)
+    assert (found["robust"] is None) == (not rest)
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     order = found["moments"]["order"]
     if found["observation"]["stable"] and order is not None:

@@ -220,6 +220,33 @@ def test_analyze_for_a_person(testbed: Command, tmp_path: Path) -> None:
     assert "unstable" in odd.out
 
 
+def test_analyze_leaves_nothing_out_for_a_person(testbed: Command, tmp_path: Path) -> None:
+    """Every figure and verdict has its line, those of RSEIO too; a scenario without model error has none of them."""
+    common = ("controllable", "observable", "critical arrival rate", "its bounds", "critical recovery rate")
+    common += ("strongly observable", "observability index I0", "observation link", "control link")
+    common += ("its bursts of losses", "its runs of deliveries", "peak, condition (i)", "peak, condition (ii)")
+    common += ("peak, d_1, d_2, …", "peak, series", "peak, largest failure rate", "order of finite moments")
+    common += ("observation losses", "control losses", "lower bound", "upper bound", "peak covariance", "convergence")
+    shown = testbed("analyze", "s.toml")
+    assert [text for text in common if text not in shown.out] == []
+    assert "0.7 · 0.3^(l−1), mean 1.42857, 99 % at most 4" in shown.out
+    assert "rseio" not in shown.out
+    robust = {"dA": [[[0.1, 0.0], [0.0, 0.0]]], "delta": 1.0}
+    rseio = [{"name": "mine", "kind": "rseio", "mu": 0.5}]
+    system = {**TABLES["system"], "C": [[1.0, 0.0]]}
+    write(tmp_path / "r.toml", system=system, uncertainty=robust, estimators=rseio, bounds=False, links=None)
+    shown = testbed("analyze", "r.toml")
+    assert (shown.code, shown.err) == (0, "")
+    common = ("mine forgets P_0", "R Theorem 5", "mine, mu = 0.5", "pairs observable", "pairs controllable", "arrivals")
+    common += ("rank of O_b", "rank of C_n", "contraction of δ", "over 8 steps", "δ from P_0", "trace without losses")
+    assert [text for text in (*common, "approached as") if text not in shown.out] == []
+    assert max(map(len, shown.out.splitlines())) <= 80
+    write(tmp_path / "r.toml", uncertainty=robust, estimators=[{"name": "rseio", "nu": 0.5}], links=None)
+    shown = testbed("analyze", "r.toml")
+    assert (shown.code, shown.out, len(shown.err.splitlines())) == (2, "", 1)
+    assert "estimators.rseio: estimator 'rseio': unknown option 'nu'; allowed: mu" in shown.err
+
+
 def test_analyze_refuses_as_every_command(testbed: Command) -> None:
     shown = testbed("analyze", "none.toml")
     assert (shown.code, shown.out) == (2, "")

@@ -92,7 +92,8 @@ def test_a_wrong_command_line(arguments: list[str], expected: str, testbed: Comm
         ),
         (
             {"links": {"control": {"loss": {"kind": "bernoully"}}}},
-            "wrong.toml: links.control.loss.kind: got 'bernoully'; allowed: none, bernoulli, markov; did you mean",
+            "wrong.toml: links.control.loss.kind: got 'bernoully'; allowed: none, bernoulli, markov, gilbert-elliott; "
+            "did you mean",
         ),
         (
             {"links": {"control": {"los": {"kind": "none"}}}},
@@ -104,7 +105,7 @@ def test_a_wrong_command_line(arguments: list[str], expected: str, testbed: Comm
         (
             {"estimators": [{"name": "kalman"}]},
             "estimators.kalman: unknown estimator 'kalman'; "
-            "allowed: aoe, ff, gpb, gpb1, gpb2, imm, kf, kfio, lmmse, oe, oe-lattice, pf, rse, rseio, rsemm",
+            "allowed: aoe, ff, gpb, gpb1, gpb2, imm, kf, kfio, lmmse, oe, oe-exact, pf, rse, rseio, rsemm",
         ),
         ({"estimators": [{"name": "aoe", "depht": 1}]}, "estimators.aoe: estimator 'aoe': unknown option 'depht'"),
         (
@@ -112,7 +113,7 @@ def test_a_wrong_command_line(arguments: list[str], expected: str, testbed: Comm
             "estimators.aoe: estimator 'aoe': unknown option 'untill'; allowed: none; did you mean 'until'?",
         ),
         ({"estimators": [{"name": "kfio"}]}, "estimators.kfio: kfio needs every ACK"),
-        ({"estimators": [{"name": "oe"}], "steps": 40}, "estimators.oe: oe enumerates 2^k histories"),
+        ({"estimators": [{"name": "oe-exact"}], "steps": 40}, "estimators.oe-exact: oe-exact enumerates 2^k histories"),
     ],
 )
 @pytest.mark.parametrize("how", [["--in-process"], []])

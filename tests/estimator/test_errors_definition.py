@@ -53,7 +53,7 @@ def test_kfio_of_a_chain_that_loses_the_first_packet() -> None:
 def test_oe_beyond_its_histories(lanes: int) -> None:
     """2^k histories a lane at step k: eight are allowed, so step 3 is the last."""
     trial = _trial(lanes=lanes)
-    est = create("oe", model_of(trial.system), lanes=lanes, options={"max_histories": 8})
+    est = create("oe-exact", model_of(trial.system), lanes=lanes, options={"max_histories": 8})
     for k in range(3):
         est.step(trial.u[k], trial.y[k], trial.arrived[k], ())
     with pytest.raises(TooManyHistories):
@@ -96,7 +96,7 @@ def test_unknown_option_is_refused_by_every_kind(kind: str) -> None:
 @pytest.mark.parametrize("value", ["many", 0, -1, None])
 def test_option_of_the_wrong_kind_is_refused(value: object) -> None:
     with pytest.raises(UsageError, match="max_histories"):
-        create("oe", model_of(_trial().system), lanes=1, options={"max_histories": value})
+        create("oe-exact", model_of(_trial().system), lanes=1, options={"max_histories": value})
 
 
 @pytest.mark.parametrize("error", [MissingAck, TooManyHistories, UsageError])

@@ -28,7 +28,7 @@ MODEL = Model(
     P0=np.eye(2),
     control=Chain.bernoulli(0.8),
 )
-KINDS = ["aoe", "ff", "gpb", "gpb1", "gpb2", "imm", "lmmse", "oe", "oe-lattice", "pf"]
+KINDS = ["aoe", "ff", "gpb", "gpb1", "gpb2", "imm", "lmmse", "oe", "oe-exact", "pf"]
 
 
 @pytest.mark.parametrize("lanes", [1, 3])

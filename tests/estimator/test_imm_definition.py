@@ -1,9 +1,8 @@
-"""IMM: one estimator with AOE for i.i.d. losses, the estimator of another library for Markov losses."""
+"""IMM: one estimator with AOE for i.i.d. losses. For Markov losses see test_other_libraries.py."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,34 +34,6 @@ def test_first_step_is_oe(trial: Trial) -> None:
 @given(trials(acks=("all",), steps=(1, 12)))
 def test_all_acks_in_time_is_kfio(trial: Trial) -> None:
     assert_same(run("imm", trial), run("kfio", trial), 1e-9)
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_is_the_imm_of_filterpy(seed: int) -> None:
-    kalman = pytest.importorskip("filterpy.kalman")
-    rng = np.random.default_rng([seed, 17])
-    system = random_system(rng, 2, 1, 1, "markov")
-    stationary = system.recovery / (system.recovery + system.failure)
-    system = replace(system, start=stationary, P0=system.P0 + np.eye(2))
-    trial = random_trial(rng, system, 12, 1, arrivals="all")
-    trial = replace(trial, u=trial.u * 0.3)
-    filters: list[Any] = []
-    for nu in (0, 1):
-        one = kalman.KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-        one.F, one.B, one.H, one.Q, one.R = system.A, nu * system.B, system.C, system.Q, system.R
-        one.x, one.P = system.x0_mean.copy(), system.P0.copy()
-        filters.append(one)
-    chain = np.array([[1 - system.recovery, system.recovery], [system.failure, 1 - system.failure]])
-    imm = kalman.IMMEstimator(filters, np.array([1 - stationary, stationary]), chain)
-    ours = create("imm", model_of(system), lanes=1)
-    assert isinstance(ours, Imm)
-    for k in range(trial.steps):
-        imm.predict(trial.u[k, 0])
-        imm.update(trial.y[k, 0])
-        out = ours.step(trial.u[k], trial.y[k], trial.arrived[k])
-        np.testing.assert_allclose(out.x_hat[0], imm.x, rtol=1e-8, atol=1e-8)
-        np.testing.assert_allclose(out.P[0], imm.P, rtol=1e-8, atol=1e-8)
-        np.testing.assert_allclose(ours.mode_probabilities[0], imm.mu, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("lanes", [1, 3])

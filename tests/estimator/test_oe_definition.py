@@ -12,7 +12,7 @@ from estimator.reference import gaussian
 from estimator.reference.cases import (
     ACKS,
     ARRIVALS,
-    CHAINS,
+    HIDDEN,
     Floats,
     System,
     Trial,
@@ -25,6 +25,7 @@ from estimator.reference.compare import covariance_error, mean_error
 from estimator.reference.drive import acks_at, model_of, run
 from testbed.estimator.registry import create
 
+CHAINS = ("bernoulli", "markov", HIDDEN)
 TOLERANCE = 1e-9
 DEGENERATE = [(1.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.4), (1.0, 1.0, 0.3), (0.0, 0.3, 1.0), (0.5, 0.0, 0.5)]
 

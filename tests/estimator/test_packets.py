@@ -186,7 +186,8 @@ def test_estimates_are_those_of_the_estimator() -> None:
         made.step(np.array([[3.0]]), np.array([[0.0]]), zero, (acks[1], acks[2])),
     ]
     for line, expected in zip(estimates(lines, "oe"), direct, strict=True):
-        assert set(line) == {"k", "x_hat", "P"}
+        assert set(line) == {"k", "x_hat", "P", "error_bound", "error_bound_P"}
+        assert line["error_bound"] == line["error_bound_P"] == 0.0
         assert line["x_hat"] == expected.x_hat[0].tolist()
         assert line["P"] == expected.P[0].tolist()
     without = estimates(lines, "oe", use_acks=False)
@@ -203,8 +204,8 @@ def test_noise_alone_is_no_observation() -> None:
 def test_what_an_estimator_refuses_names_the_step() -> None:
     with pytest.raises(MissingAck, match=r"^step 1: kfio needs the ACK"):
         estimates([FIRST], "kfio")
-    with pytest.raises(TooManyHistories, match=r"^step 2: oe would need 4 histories"):
-        estimates([FIRST, '{"k": 2, "u": [1.0]}'], "oe", max_histories=2)
+    with pytest.raises(TooManyHistories, match=r"^step 2: oe-exact would need 4 histories"):
+        estimates([FIRST, '{"k": 2, "u": [1.0]}'], "oe-exact", max_histories=2)
 
 
 @pytest.mark.parametrize("u", [1.0, 0.0])

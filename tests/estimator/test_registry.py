@@ -35,7 +35,7 @@ BUILT_IN = [
     "kfio",
     "lmmse",
     "oe",
-    "oe-lattice",
+    "oe-exact",
     "pf",
     "rse",
     "rseio",
@@ -122,7 +122,7 @@ def test_a_registered_name_does_not_replace_a_built_in_one() -> None:
         (
             "oe",
             {"max_history": 1},
-            "estimator 'oe': unknown option 'max_history'; allowed: max_histories; did you mean",
+            "estimator 'oe': unknown option 'max_history'; allowed: tolerance, max_histories, max_lag; did you mean",
         ),
         ("oe", {"max_histories": 0}, "estimator 'oe': max_histories: got 0; "),
         ("oe", {"max_histories": "4"}, "estimator 'oe': max_histories: got '4'; "),
@@ -186,8 +186,9 @@ def test_kfio_runs_where_every_ack_that_matters_is_there() -> None:
 def test_oe_runs_as_long_as_its_histories_fit(limit: int, longest: int) -> None:
     options = {"max_histories": limit}
     for until in range(max(1, longest - 1), longest + 3):
-        assert allowed("oe", "none", until, options) == (until <= longest)
-    assert allowed("oe", "none", 50, options, links={})
+        assert allowed("oe-exact", "none", until, options) == (until <= longest)
+        assert allowed("oe", "none", until, options)
+    assert allowed("oe-exact", "none", 50, options, links={})
 
 
 def test_the_model_is_that_of_the_scenario() -> None:

@@ -19,7 +19,23 @@ from testbed.estimator.model import Ack, Estimate, Estimator
 from testbed.estimator.registry import create
 from testbed.estimator.snapshot import MAX_BYTES, Snapshot, restore, take
 
-KINDS = ["aoe", "ff", "gpb", "gpb1", "gpb2", "imm", "kf", "kfio", "lmmse", "pf", "rse", "rseio", "rsemm"]
+KINDS = [
+    "aoe",
+    "ff",
+    "gpb",
+    "gpb1",
+    "gpb2",
+    "imm",
+    "kf",
+    "kfio",
+    "lmmse",
+    "oe",
+    "oe-exact",
+    "pf",
+    "rse",
+    "rseio",
+    "rsemm",
+]
 NEEDS_ACKS = ("kf", "kfio", "rse", "rseio", "rsemm")
 INDEPENDENT = ("ff", "lmmse")
 STEPS = 9

@@ -33,7 +33,7 @@ def results(values: Floats, blocks: list[tuple[int, int]] | None = None) -> list
     moments = LaneMoments(figures, lanes)
     for lane, size in blocks or [(0, lanes)]:
         moments.add(lane, values[:, lane : lane + size])
-    return [moments.result(i) for i in range(figures)]
+    return [moments.results()[i] for i in range(figures)]
 
 
 def exact(values: list[float]) -> tuple[float, float]:

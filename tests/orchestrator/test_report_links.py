@@ -5,7 +5,11 @@ import numpy as np
 import pytest
 
 from orchestrator.fabricated_summary import SCENARIO_TOML, fabricate, link
+from testbed.analysis.bursts import run_law
+from testbed.channel.chains import chain_of
+from testbed.channel.service import loss_process
 from testbed.orchestrator.report.link_model import expected_links
+from testbed.scenario import parse_scenario
 
 
 def expected(loss: str, steps: int = 6, lanes: int = 4, mode: str = ""):
@@ -41,6 +45,32 @@ def test_markov_that_does_not_start_stationary():
     assert model.loss_rate == pytest.approx(enumerate_loss(0.2, 0.1, 0.0, 6)[0])
 
 
+def enumerate_hidden(to_bad, to_good, loss_good, loss_bad, start_good, steps):
+    """Mean and standard deviation of the share of losses in one lane, over all paths of states and fates."""
+    moments = np.zeros(2)
+    for path in itertools.product((0, 1), repeat=steps):
+        chance = start_good if path[0] else 1 - start_good
+        for before, after in itertools.pairwise(path):
+            good = 1 - to_bad if before else to_good
+            chance *= good if after else 1 - good
+        lost = np.where(np.array(path) == 1, loss_good, loss_bad)
+        mean = lost.mean()
+        moments += chance * np.array([mean, mean**2 + (lost * (1 - lost)).sum() / steps**2])
+    return moments[0], math.sqrt(moments[1] - moments[0] ** 2)
+
+
+@pytest.mark.parametrize(("to_bad", "to_good"), [(0.1, 0.3), (0.9, 0.8)])
+def test_gilbert_elliott_loss_rate_against_all_paths(to_bad, to_good):
+    table = f'{{ kind = "gilbert-elliott", to_bad = {to_bad}, to_good = {to_good}, loss_good = 0.1, loss_bad = 0.6'
+    model = expected(table + " }")
+    mean, deviation = enumerate_hidden(to_bad, to_good, 0.1, 0.6, to_good / (to_bad + to_good), 6)
+    assert model.loss_rate == pytest.approx(mean)
+    assert model.loss_rate_deviation == pytest.approx(deviation / math.sqrt(4))
+    assert expected(table + ", start_good = 1.0 }").loss_rate == pytest.approx(
+        enumerate_hidden(to_bad, to_good, 0.1, 0.6, 1.0, 6)[0]
+    )
+
+
 def test_bernoulli_loss_rate_against_all_paths():
     model = expected('{ kind = "bernoulli", arrival = 0.7 }')
     mean, deviation = enumerate_loss(0.7, 0.3, 0.7, 6)
@@ -72,3 +102,17 @@ def test_spread_of_the_mean_burst_of_many_runs():
     assert np.mean([run.mean_burst for run in runs]) == pytest.approx(model.mean_burst, rel=0.01)
     assert np.std([run.mean_burst for run in runs]) == pytest.approx(model.mean_burst_deviation, rel=0.15)
     assert np.std([run.loss_rate for run in runs]) == pytest.approx(model.loss_rate_deviation, rel=0.15)
+
+
+def test_spread_of_the_mean_burst_behind_a_hidden_state():
+    """Bursts are correlated through the state; 1200 lanes at once, each with its own mean."""
+    loss = {"kind": "gilbert-elliott", "to_bad": 0.01, "to_good": 0.02, "loss_good": 0.1, "loss_bad": 0.7}
+    system = {"A": [[1.0]], "C": [[1.0]], "Q": [[1.0]], "R": [[1.0]]}
+    scenario = parse_scenario({"system": system, "lanes": 1200, "links": {"observation": {"loss": loss}}})
+    process = loss_process(scenario, "observation", 0, 1200)
+    arrived = np.array([process.next(k) for k in range(3000)])
+    begins = (arrived[:-1] & ~arrived[1:]).sum(axis=0)
+    means = (~arrived).sum(axis=0) / begins
+    law = run_law(chain_of(scenario.links.observation.loss), False)
+    assert np.mean(means) == pytest.approx(law.mean, rel=0.03)
+    assert np.std(means) == pytest.approx(math.sqrt(law.variance_of_mean / begins.mean()), rel=0.1)

@@ -89,6 +89,10 @@ losses: st.SearchStrategy[dict[str, Any]] = st.one_of(
         {"kind": st.just("markov"), "recovery": probabilities, "failure": st.floats(0.01, 1)},
         optional={"start": probabilities},
     ),
+    st.fixed_dictionaries(
+        {"kind": st.just("gilbert-elliott"), "to_bad": probabilities, "to_good": st.floats(0.01, 1)},
+        optional={"loss_good": st.floats(0, 0.3), "loss_bad": st.floats(0.3, 1), "start_good": probabilities},
+    ),
     st.fixed_dictionaries({"kind": st.just("markov"), "loss": st.floats(0, 0.5), "mean_burst": st.floats(1, 1e6)}),
 )
 links = st.fixed_dictionaries({}, optional={"loss": losses})

@@ -24,6 +24,7 @@ SYSTEM: dict[str, Any] = {
 BASE: dict[str, Any] = {"system": SYSTEM, "estimators": [{"name": "oe"}]}
 ABSENT = object()
 LOSS = "links.control.loss"
+_TO_GOOD = "Probability that a bad state is followed by a good one, 0 … 1"
 NAN, INF = float("nan"), float("inf")
 
 
@@ -110,13 +111,16 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     ({"links.control.on_loss": "noise"}, "links.control: unknown key 'on_loss'; did you mean 'loss'?"),
     # losses
-    ({f"{LOSS}.arrival": 0.5}, f"{LOSS}.kind: missing; allowed: none, bernoulli, markov"),
+    ({f"{LOSS}.arrival": 0.5}, f"{LOSS}.kind: missing; allowed: none, bernoulli, markov, gilbert-elliott"),
     (
         {f"{LOSS}.kind": "bernouli"},
-        f"{LOSS}.kind: got 'bernouli'; allowed: none, bernoulli, markov; did you mean 'bernoulli'?",
+        f"{LOSS}.kind: got 'bernouli'; allowed: none, bernoulli, markov, gilbert-elliott; did you mean 'bernoulli'?",
     ),
-    ({LOSS: "bernoulli"}, f"{LOSS}: got 'bernoulli'; allowed: a table with a kind: none, bernoulli, markov"),
-    ({LOSS: {"kind": ["markov"]}}, f"{LOSS}.kind: got ['markov']; allowed: none, bernoulli, markov"),
+    (
+        {LOSS: "bernoulli"},
+        f"{LOSS}: got 'bernoulli'; allowed: a table with a kind: none, bernoulli, markov, gilbert-elliott",
+    ),
+    ({LOSS: {"kind": ["markov"]}}, f"{LOSS}.kind: got ['markov']; allowed: none, bernoulli, markov, gilbert-elliott"),
     ({LOSS: {"kind": "bernoulli", "arival": 0.5}}, f"{LOSS}: unknown key 'arival'; did you mean 'arrival'?"),
     (
         {LOSS: {"kind": "bernoulli", "loss": 0.5, "arival": 0.5}},
@@ -150,6 +154,28 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     (
         {LOSS: {"kind": "markov", "loss": 0.5, "mean_burst": 2, "start": 3}},
         f"{LOSS}.start: got 3; allowed: 0 … 1",
+    ),
+    ({LOSS: {"kind": "gilbert-elliott", "to_bad": 0.1}}, f"{LOSS}.to_good: missing; needed: {_TO_GOOD}"),
+    (
+        {LOSS: {"kind": "gilbert-elliott", "to_bad": 0, "to_good": 0.0}},
+        f"{LOSS}: got to_bad 0 and to_good 0; allowed: to_bad + to_good more than 0",
+    ),
+    (
+        {LOSS: {"kind": "gilbert-elliott", "to_bad": 0.1, "to_good": 0.5, "loss_good": 0.2, "loss_bad": 0.1}},
+        f"{LOSS}.loss_good: got 0.2; allowed with loss_bad 0.1: 0 … 0.1, the bad state being the one that loses more",
+    ),
+    (
+        {LOSS: {"kind": "gilbert-elliott", "to_bad": 0.1, "to_good": 0.5, "loss_bad": 1.5}},
+        f"{LOSS}.loss_bad: got 1.5; allowed: 0 … 1",
+    ),
+    (
+        {LOSS: {"kind": "gilbert-elliott", "to_bad": 0.1, "to_good": 0.5, "start": 0.5}},
+        f"{LOSS}: unknown key 'start'; did you mean 'start_good'?",
+    ),
+    (
+        {LOSS: {"kind": "gilbert", "to_bad": 0.1, "to_good": 0.5}},
+        f"{LOSS}.kind: got 'gilbert'; allowed: none, bernoulli, markov, gilbert-elliott; did you mean "
+        "'gilbert-elliott'?",
     ),
     (
         {"links.ack.loss": {"kind": "bernoulli", "arrival": 0.5}},

@@ -1,4 +1,4 @@
-"""Which moments of the error covariance are finite under Markov observation losses."""
+"""Which moments of the error covariance are finite under correlated observation losses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from testbed.channel.loss import Chain
+from testbed.channel.law import LossModel
 from testbed.numerics.lanes import Floats
 
 
@@ -15,14 +15,14 @@ def spectral_radius(A: Floats) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(A))))
 
 
-def finite_moment_order(A: Floats, observation: Chain) -> float:
+def finite_moment_order(A: Floats, observation: LossModel) -> float:
     """The order r* up to which moments of the stationary error covariance can be finite: r < r* is necessary.
 
-    In a run of losses the covariance grows by ρ(A)² a step and the run goes on with probability 1 − recovery, so that
-    its r-th moment needs ρ^{2r} (1 − recovery) < 1 (P Corollary 9: necessary and sufficient for scalar systems).
-    Infinite for ρ ≤ 1 or where a loss is never followed by another.
+    In a run of losses the covariance grows by ρ(A)² a step, and P(m losses in a row) falls like θ^m, θ = burst_decay,
+    so that its r-th moment needs ρ^{2r} θ < 1. For a Markov chain θ = 1 − recovery (P Corollary 9: necessary and
+    sufficient for scalar systems). Infinite for ρ ≤ 1 or where a loss is never followed by another.
     """
-    rho, persistence = spectral_radius(A), 1.0 - observation.recovery
+    rho, persistence = spectral_radius(A), observation.burst_decay
     if rho <= 1.0 or persistence <= 0.0 or observation.never_loses:
         return math.inf
     return -math.log(persistence) / (2.0 * math.log(rho)) if persistence < 1.0 else 0.0

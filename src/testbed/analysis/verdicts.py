@@ -8,26 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from testbed.analysis.bursts import delivered_run, lost_run
+from testbed.analysis.bursts import delivered_run, lost_run, run_law
+from testbed.analysis.convergence import Knowledge, convergence, settled
 from testbed.analysis.critical import CriticalArrival, critical_arrival, observed_at_once, recovery_threshold
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.analysis.peak import burst_series, condition_two, failure_limit, growth_factors, scalar_peak_is_stable
+from testbed.analysis.robust_verdicts import robust_figures
 from testbed.analysis.strong import StrongObservability, strong_observability
 from testbed.analysis.structure import Reach, controllability, observability, unstable_eigenvalues
 from testbed.channel.chains import chain_of
+from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain
 from testbed.numerics.lanes import Floats
-from testbed.scenario import (
-    ConstantInput,
-    ExponentialInput,
-    FeedbackInput,
-    Input,
-    Links,
-    Loss,
-    Scenario,
-    SineInput,
-    UniformInput,
-)
+from testbed.scenario import FeedbackInput, Input, Links, Loss, Scenario
 
 _AT_THRESHOLD = 1e-9
 """Relative distance below which a rate counts as equal to its threshold; no theorem decides there."""
@@ -47,10 +41,11 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the verdicts need of a system: A (n, n), C (p, n) and what was found out about them."""
+    """What the verdicts need of a system: A (n, n), C (p, n), Q (n, n) and what was found out about them."""
 
     A: Floats
     C: Floats
+    Q: Floats
     radius: float
     controllable: Reach
     observable: Reach
@@ -63,6 +58,7 @@ class Facts:
         return cls(
             A,
             C,
+            Q,
             spectral_radius(A),
             controllability(A, Q),
             observability(A, C),
@@ -75,14 +71,21 @@ class Facts:
         """Whether the noise reaches every eigenvalue outside the open unit disc."""
         return self.controllable.stable_rest
 
-    def growth(self, chain: Chain) -> float:
-        """ρ² (1 − recovery): what a burst grows by, times the probability that it goes on; maybe infinite."""
-        return self.radius * self.radius * (1.0 - chain.recovery) if chain.recovery < 1.0 else 0.0
+    def growth(self, losses: LossModel) -> float:
+        """ρ² θ: what a burst grows by, times the factor by which longer ones are rarer; maybe infinite.
+
+        θ = 1 − recovery for a chain of arrivals.
+        """
+        return self.radius * self.radius * losses.burst_decay if losses.burst_decay > 0.0 else 0.0
+
+    @property
+    def strongly_built(self) -> bool:
+        """M Assumptions 1, but for the chain (controllable, observable), and 2."""
+        return self.controllable.full and self.observable.full and self.strong.holds
 
     def strongly(self, chain: Chain) -> bool:
         """Whether M Theorem 5 applies: M Assumptions 1 (controllable, observable, the chain irreducible) and 2."""
-        structure = self.controllable.full and self.observable.full and self.strong.holds
-        return structure and chain.recovery > 0.0 and chain.failure > 0.0
+        return self.strongly_built and chain.recovery > 0.0 and chain.failure > 0.0
 
     @property
     def scalar(self) -> bool:
@@ -105,7 +108,7 @@ def analyze(scenario: Scenario) -> dict[str, Any]:
 def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
     A = facts.A
     observed, controlled = scenario.links.observation.loss, scenario.links.control.loss
-    chain = chain_of(observed)
+    chain, control = _simplest(chain_of(observed)), _simplest(chain_of(controlled))
     verdict = observation_verdict(facts, chain)
     return {
         "name": scenario.name,
@@ -130,8 +133,8 @@ def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
         "critical_recovery": recovery_threshold(A),
         "observation": {**_link(observed, chain), **verdict.table()},
         "control": {
-            **_link(controlled, chain_of(controlled)),
-            **control_verdict(verdict, chain_of(controlled), scenario.input, scenario.links).table(),
+            **_link(controlled, control),
+            **control_verdict(verdict, control, scenario.input, scenario.links).table(),
         },
         "bounds": {
             "lower": Verdict(verdict.stable, verdict.theorem, f"covariance with every ACK: {verdict.reason}").table(),
@@ -139,11 +142,23 @@ def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
         },
         "peak": peak_figures(facts, chain),
         "moments": moment_figures(facts, chain, verdict),
-        "convergence": convergence(facts, chain, scenario.input),
+        "convergence": convergence(
+            facts.observable,
+            facts.controllable,
+            settled(A, facts.C, facts.Q, np.array(scenario.system.R)),
+            Knowledge(chain, chain_of(controlled), scenario.links.ack.mode == "perfect"),
+            scenario.input,
+        ),
+        "robust": robust_figures(scenario),
     }
 
 
-def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
+def _simplest(losses: LossModel) -> LossModel:
+    """The chain of arrivals that a Gilbert–Elliott channel is, if it is one: then the theorems for chains hold."""
+    return (losses.as_chain or losses) if isinstance(losses, GilbertElliott) else losses
+
+
+def observation_verdict(facts: Facts, chain: LossModel) -> Verdict:
     """Whether the expected covariance with every ACK stays bounded, for the observation link ``chain``."""
     if facts.radius < 1.0:
         return Verdict(True, "ρ(A) < 1", "the covariance stays bounded without any observation")
@@ -158,6 +173,8 @@ def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
         return Verdict(None, "none", "no losses, but the noise does not reach all that grows")
     if not facts.noise_feeds_growth:
         return Verdict(None, "none", "(A, sqrt Q) is not stabilisable: no theorem here applies")
+    if isinstance(chain, GilbertElliott):
+        return hidden_verdict(facts, chain)
     threshold = recovery_threshold(facts.A)
     growth = f"ρ²(1 − recovery) = {facts.growth(chain):.6g}"
     if threshold == 0.0 and chain.recovery > 0.0:
@@ -181,12 +198,43 @@ def observation_verdict(facts: Facts, chain: Chain) -> Verdict:
     return Verdict(None, "none", f"{below}: {why}; {facts.strong.reason}")
 
 
-def control_verdict(observation: Verdict, chain: Chain, source: Input | None, links: Links) -> Verdict:
+def hidden_verdict(facts: Facts, losses: GilbertElliott) -> Verdict:
+    """The same for a hidden chain behind the arrivals, where the system is detectable and the noise feeds its growth.
+
+    Necessary: E[P̄_k] ≥ Σ_m P(the last m packets lost) A^m Q A'^m, and that probability falls like θ^m. Sufficient: if
+    one observation determines the unstable part, that sum with A^m A'^m bounds it from above too. Otherwise the
+    arrivals dominate independent ones: P(lost | past) is at most ``worst_loss`` in the end, and P is monotone in γ, so
+    that what holds for independent losses of more than that rate holds here.
+    """
+    theta, worst, threshold = losses.burst_decay, losses.worst_loss, recovery_threshold(facts.A)
+    growth = f"ρ²θ = {facts.growth(losses):.6g}"
+    if _equal(theta, 1.0 - threshold):
+        return Verdict(None, "none", f"{growth}: at the threshold θ = {1.0 - threshold:.6g}, which is not decided")
+    if theta > 1.0 - threshold:
+        return Verdict(False, "bursts", f"{growth} > 1: a burst of losses outgrows its probability")
+    if observed_at_once(facts.A, facts.C):
+        return Verdict(True, "bursts", f"{growth} < 1, one observation determines the unstable part")
+    arrival = f"arrivals dominate independent ones of rate {1.0 - worst:.6g}"
+    if facts.strongly_built and worst < 1.0 - threshold and not _equal(worst, 1.0 - threshold):
+        return Verdict(True, "domination, M Theorem 5", f"{arrival} > {threshold:.6g}, strongly observable")
+    upper = facts.critical.upper
+    if upper is not None and 1.0 - worst > upper and not _equal(1.0 - worst, upper):
+        return Verdict(True, "domination, Sinopoli upper bound", f"{arrival} > {upper:.6g}")
+    return Verdict(None, "none", f"{growth} < 1: necessary, not known to be sufficient; {facts.strong.reason}")
+
+
+def control_verdict(observation: Verdict, chain: LossModel, source: Input | None, links: Links) -> Verdict:
     """Whether losses of controls leave the expected covariance of OE and AOE bounded (D Theorem 2, M Theorem 4)."""
     if source is None or chain.never_loses or links.ack.mode == "perfect":
         known = "there is no input" if source is None else "the fate of every control packet is known"
         return Verdict(observation.stable, "separation", f"{known}: as with the observation link alone")
     theorem = "D Theorem 2" if chain.independent else "M Theorem 4"
+    if isinstance(chain, GilbertElliott):
+        theorem = "S, correlated"
+        if abs(chain.memory) == 1.0:
+            return Verdict(
+                False if observation.stable is False else None, theorem, "the states alternate: S is not bounded"
+            )
     if isinstance(source, FeedbackInput):
         return Verdict(
             False if observation.stable is False else None, theorem, "u is fed back, so that its bound is not known"
@@ -203,10 +251,12 @@ def upper_bound_verdict(observation: Verdict, source: Input | None) -> Verdict:
     return Verdict(observation.stable, "M Theorem 3", "the recursion with every ACK, and ¼ U more noise")
 
 
-def peak_figures(facts: Facts, chain: Chain) -> dict[str, Any]:
+def peak_figures(facts: Facts, chain: LossModel) -> dict[str, Any]:
     """P Theorem 6, and Theorem 8 for scalar systems."""
     out: dict[str, Any] = dict.fromkeys(("condition_i", "condition_ii", "left_side", "d", "series", "series_tail"))
     out |= {"failure_max": None, "critical_recovery": recovery_threshold(facts.A)}
+    if isinstance(chain, GilbertElliott):
+        return {**out, **Verdict(None, "none", "P is for Markov arrivals, and these have a hidden state").table()}
     if not facts.observable.full:
         return {**out, **Verdict(None, "P Theorem 6", "(A, C) is not observable").table()}
     index, condition_i = facts.observable.index, facts.growth(chain) < 1.0
@@ -237,7 +287,7 @@ def _peak_verdict(facts: Facts, chain: Chain, first: bool, second: bool | None) 
     return Verdict(None, "P Theorem 6", "condition (ii) is not known to hold; it is sufficient only")
 
 
-def moment_figures(facts: Facts, chain: Chain, observation: Verdict) -> dict[str, Any]:
+def moment_figures(facts: Facts, chain: LossModel, observation: Verdict) -> dict[str, Any]:
     """Order of the finite moments of the covariance (P Corollary 9); None where nothing is decided.
 
     Necessary in general. Sufficient for scalar systems, and where one observation determines the unstable part.
@@ -255,52 +305,13 @@ def moment_figures(facts: Facts, chain: Chain, observation: Verdict) -> dict[str
             return False
         if order <= r and facts.noise_feeds_growth:
             return False
-        return True if sufficient and order > r and facts.radius > 1.0 and chain.recovery > 0.0 else None
+        return True if sufficient and order > r and facts.radius > 1.0 and chain.burst_decay < 1.0 else None
 
     return {
         "order": order,
         "finite_mean": observation.stable if finite(1.0) is None else finite(1.0),
         "finite_variance": finite(2.0),
     }
-
-
-def convergence(facts: Facts, observation: Chain, source: Input | None) -> dict[str, Any]:
-    """D Theorem 3: without losses of observations, and with u_k → 0, E[P̄_k] tends to the solution of the ARE.
-
-    ``holds`` is None where the premises are not met or not known: the theorem gives no converse.
-    """
-
-    def answer(holds: bool | None, exponential: bool, reason: str) -> dict[str, Any]:
-        return {"holds": holds, "exponential": exponential, "theorem": "D Theorem 3", "reason": reason}
-
-    if not observation.never_loses:
-        return answer(None, False, "observations are lost")
-    if not (facts.observable.full and facts.controllable.full):
-        return answer(None, False, "(A, C) is not observable, or (A, sqrt Q) not controllable")
-    vanishes, text = vanishing_input(source)
-    if vanishes:
-        return answer(True, True, f"no observation is lost and {text}")
-    return answer(None, False, text)
-
-
-def vanishing_input(source: Input | None) -> tuple[bool | None, str]:
-    """Whether u_k → 0 (each kind that does so does it exponentially), None if unknown, and why, from the kind."""
-    if source is None:
-        return True, "there is no input"
-    if isinstance(source, ConstantInput):
-        zero = _zero(source.value)
-        return zero, "u = 0" if zero else "u is constant and not zero"
-    if isinstance(source, ExponentialInput):
-        zero = _zero(source.offset)
-        return zero, "u tends to 0 exponentially" if zero else "u tends to an offset that is not zero"
-    if isinstance(source, SineInput):
-        zero = _zero(source.offset) and _zero(source.amplitude)
-        return zero, "u = 0" if zero else "u is a sine: it does not tend to 0"
-    if isinstance(source, UniformInput):
-        zero = _zero(source.low) and _zero(source.high)
-        return zero, "u = 0" if zero else "u is drawn afresh at each step: it does not tend to 0"
-    kind = "fed back" if isinstance(source, FeedbackInput) else "a table of finite length"
-    return None, f"u is {kind}: its limit is not known"
 
 
 def _marginal(facts: Facts, chain: Chain) -> Verdict:
@@ -314,22 +325,24 @@ def _equal(a: float, b: float) -> bool:
     return math.isclose(a, b, rel_tol=_AT_THRESHOLD)
 
 
-def _zero(value: float | tuple[float, ...]) -> bool:
-    return not np.any(value)
-
-
-def _link(loss: Loss, chain: Chain) -> dict[str, Any]:
+def _link(loss: Loss, losses: LossModel) -> dict[str, Any]:
     """The figures of a link's losses; lengths that are infinite, or of what never comes, are None."""
-    bad, good = lost_run(chain), delivered_run(chain)
-    loses = not chain.never_loses
+    hidden = isinstance(losses, GilbertElliott)
+    bad = run_law(losses, False) if isinstance(losses, GilbertElliott) else lost_run(losses)
+    good = run_law(losses, True) if isinstance(losses, GilbertElliott) else delivered_run(losses)
+    if losses.never_loses:
+        bad = None
     return {
         "kind": loss.kind,
-        "recovery": chain.recovery,
-        "failure": chain.failure,
-        "stationary_loss": 1.0 - chain.arrival,
-        "mean_burst": bad.mean if loses else None,
-        "burst_99": bad.quantile(0.99) if loses else None,
-        "mean_good_run": good.mean,
+        "recovery": None if hidden else losses.recovery,
+        "failure": None if hidden else losses.failure,
+        "stationary_loss": 1.0 - losses.arrival,
+        "mean_burst": bad.mean if bad is not None else None,
+        "burst_99": bad.quantile(0.99) if bad is not None else None,
+        "mean_good_run": good.mean if good is not None else None,
+        "burst_decay": losses.burst_decay,
+        "correlation": losses.coupling * losses.memory,
+        "memory": losses.memory,
     }
 
 

@@ -36,6 +36,11 @@ class Chain:
         return cls(recovery, failure, recovery / (recovery + failure) if start is None else start)
 
     @property
+    def as_chain(self) -> Chain:
+        """Itself: what is more than a chain of arrivals may be one in a special case."""
+        return self
+
+    @property
     def never_loses(self) -> bool:
         return self.start == 1.0 and self.failure == 0.0
 
@@ -46,6 +51,11 @@ class Chain:
         return abs(self.recovery - stays) <= 1e-15 and abs(self.start - self.recovery) <= 1e-15
 
     @property
+    def first_arrival(self) -> float:
+        """P(first packet delivered)."""
+        return self.start
+
+    @property
     def arrival(self) -> float:
         """Stationary arrival probability."""
         return self.recovery / (self.recovery + self.failure)
@@ -54,6 +64,21 @@ class Chain:
     def mean_burst(self) -> float | None:
         """Mean length of a run of losses, 1/recovery; None if losses never end."""
         return 1.0 / self.recovery if self.recovery > 0.0 else None
+
+    @property
+    def memory(self) -> float:
+        """r of Corr(γ_0, γ_j) = r^j, in the stationary law."""
+        return 1.0 - self.recovery - self.failure
+
+    @property
+    def coupling(self) -> float:
+        """1: the fate is the state. See GilbertElliott."""
+        return 1.0
+
+    @property
+    def burst_decay(self) -> float:
+        """P(m losses in a row) falls like burst_decay^m."""
+        return 1.0 - self.recovery
 
     def arrival_given(self, last: Mask | None) -> float | np.ndarray:
         """P(this packet is delivered | the fate of the one before); ``None`` before the first packet."""

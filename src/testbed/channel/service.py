@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.channel.chains import chain_of
+from testbed.channel.gilbert_elliott import GilbertElliott, GilbertElliottProcess
+from testbed.channel.law import LossModel
 from testbed.channel.loss import LossCounts, LossProcess
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
@@ -35,12 +37,25 @@ def builder(link: LinkName) -> Any:
     return partial(LinkService, link=link)
 
 
-def loss_process(scenario: Scenario, link: LinkName, lane: int, lanes: int) -> LossProcess:
-    """The loss process of a block of lanes of a link; the same draws wherever it runs."""
+def losses_of(scenario: Scenario, link: LinkName) -> LossModel:
+    """The loss model of a link; that of an ACK link that is none or perfect loses nothing."""
     settings = getattr(scenario.links, link)
-    loss = settings.loss if isinstance(settings, Link) or settings.mode == "link" else NoLoss()
-    stream = Stream(scenario.seed, role_of(link), "loss", width=1, lane=lane, lanes=lanes)
-    return LossProcess(chain_of(loss), stream, lanes)
+    return chain_of(settings.loss if isinstance(settings, Link) or settings.mode == "link" else NoLoss())
+
+
+def loss_process(scenario: Scenario, link: LinkName, lane: int, lanes: int) -> LossProcess | GilbertElliottProcess:
+    """The loss process of a block of lanes of a link; the same draws wherever it runs.
+
+    The hidden states have a stream of their own: the draws that decide over the packets are the same for every loss.
+    """
+
+    def stream(purpose: str) -> Stream:
+        return Stream(scenario.seed, role_of(link), purpose, width=1, lane=lane, lanes=lanes)
+
+    losses = losses_of(scenario, link)
+    if isinstance(losses, GilbertElliott):
+        return GilbertElliottProcess(losses, stream("state"), stream("loss"), lanes)
+    return LossProcess(losses, stream("loss"), lanes)
 
 
 class LinkService:
@@ -68,8 +83,8 @@ class LinkService:
     def _pass_on(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         lane = packet.lane
         arrived = self._losses[lane].next(packet.step - packet.FIRST_STEP)
-        self._counts.count(lane, arrived)
         self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
+        self._counts.count(lane, arrived)
 
     def _content_of(self, arrays: dict[str, NDArray[Any]], arrived: Mask) -> dict[str, NDArray[Any]]:
         if self._instead is not None:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from testbed.channel.loss import Chain, LossCounts
-from testbed.channel.service import loss_process
+from testbed.channel.law import LossModel
+from testbed.channel.loss import LossCounts
+from testbed.channel.service import loss_process, losses_of
 from testbed.scenario import Scenario
 from testbed.wire.keys import LinkName
 
@@ -21,20 +22,20 @@ class Trace:
 
     rows: list[tuple[int, int, int | None]]
     counts: LossCounts
-    chain: Chain
+    losses: LossModel
 
     def figures(self) -> dict[str, Any]:
         """Counts and rates beside those of the stationary model; None where there is nothing to average."""
-        counts, chain = self.counts, self.chain
-        lossless = chain.never_loses
+        counts, losses = self.counts, self.losses
+        lossless = losses.never_loses
         return {
             "sent": counts.sent,
             "delivered": counts.delivered,
             "dropped": counts.dropped,
             "loss_rate": counts.dropped / counts.sent,
             "mean_burst": counts.dropped / counts.bursts if counts.bursts else None,
-            "expected_loss_rate": 0.0 if lossless else 1.0 - chain.arrival,
-            "expected_mean_burst": None if lossless else chain.mean_burst,
+            "expected_loss_rate": 0.0 if lossless else 1.0 - losses.arrival,
+            "expected_mean_burst": None if lossless else losses.mean_burst,
         }
 
 
@@ -46,7 +47,7 @@ def sample_trace(scenario: Scenario, link: LinkName, number: int, *, seed: int, 
         arrived = process.next(seq)
         counts.count(lane, arrived)
         rows.append((seq, seq * period_ns, seq * period_ns if arrived else None))
-    return Trace(rows, counts, process.chain)
+    return Trace(rows, counts, losses_of(scenario, link))
 
 
 def write_trace(path: Path, trace: Trace) -> None:

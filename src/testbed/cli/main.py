@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from testbed import __version__
-from testbed.cli import analyze, link, replay, run, schema
+from testbed.cli import analyze, conformance, link, replay, run, schema
 from testbed.errors import TestbedError
 
 app = typer.Typer(
@@ -23,6 +23,7 @@ app = typer.Typer(
 )
 app.command("run")(run.run)
 app.command("analyze")(analyze.analyze)
+app.command("conformance")(conformance.conformance)
 app.command("replay")(replay.replay)
 app.command("schema")(schema.schema)
 app.add_typer(link.app, name="link")
@@ -64,10 +65,12 @@ def run_command(arguments: list[str] | None = None) -> int:
         text = str(error.format_message())  # type: ignore[attr-defined]
         return _refuse(" ".join(text.split()), 2)
     except (KeyboardInterrupt, typer.Abort):
-        return _refuse("interrupted", 130)
+        code = 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    if code == 130:
+        return _refuse("interrupted", 130)
     return code if isinstance(code, int) else 0
 
 

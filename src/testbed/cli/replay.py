@@ -19,20 +19,25 @@ def replay(
     estimator: Annotated[str, typer.Option(metavar="NAME", help="An estimator of the scenario, or a kind.")],
     out: Annotated[Path | None, typer.Option(metavar="OUT.jsonl", help="Estimates; default stdout.")] = None,
     lane: Annotated[int, typer.Option(min=0, help="Lane of the recording.")] = 0,
+    buffer: Annotated[
+        int, typer.Option(metavar="STEPS", help="Use observations and ACKs that are late by up to so many steps.")
+    ] = 0,
 ) -> None:
     """Run an estimator over recorded packets, without a network: a line {"k", "x_hat", "P"} a step.
 
-    The estimator gets the ACKs that the packets hold, unless its table says acks = "none".
+    The estimator gets the ACKs that the packets hold, unless its table says acks = "none". Without --buffer, late
+    observations are counted and not used.
     """
     from testbed.estimator.packets import read_packets
     from testbed.estimator.packets import replay as replay_packets
+    from testbed.estimator.refilter import Refilter
     from testbed.estimator.registry import create, model_of
     from testbed.scenario import EstimatorSpec, load_scenario
 
     loaded = load_scenario(scenario)
     spec = next((s for s in loaded.estimators if s.name == estimator), None) or EstimatorSpec(name=estimator)
     model = model_of(loaded)
-    made = create(spec.kind, model, lanes=1, options=spec.options, lane=lane)
+    made = Refilter(create(spec.kind, model, lanes=1, options=spec.options, lane=lane), buffer)
     lines = _lines(packets, lane, perfect=spec.acks == "perfect")
     written = []
     try:

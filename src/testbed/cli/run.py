@@ -52,7 +52,7 @@ def run(
         sys.stdout.write((out / "summary.json").read_text())
     else:
         Console().print(end_table(summary, out))
-    if summary.status != "complete":
+    if summary.status == "failed":
         console.print(f"testbed: run {summary.status}: {summary.reason}", markup=False, highlight=False, soft_wrap=True)
     raise typer.Exit(EXIT_CODES[summary.status])
 

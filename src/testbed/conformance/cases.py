@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.law import Law, LossModel, law_of
 from testbed.channel.loss import Chain
 from testbed.estimator.model import Ack, Model
 from testbed.numerics.lanes import Floats
 
 MARKOV = Chain.markov(0.6, 0.2)
 BERNOULLI = Chain.bernoulli(0.75)
+HIDDEN = GilbertElliott.of(0.3, 0.4, loss_good=0.1, loss_bad=0.8)
 _ARRAYS = ("u", "y", "arrived", "nu", "x")
 _OBSERVATION = Chain.markov(0.7, 0.3)
 
@@ -69,17 +72,17 @@ class Case:
         return replace(self, model=model, x=self.x @ T.T)
 
 
-def one(control: Chain) -> Model:
+def one(control: LossModel) -> Model:
     """n = p = q = 1, unstable."""
     return _model([[1.1]], [[1.0]], [[1.0]], [[0.5]], [[0.4]], control)
 
 
-def two(control: Chain) -> Model:
+def two(control: LossModel) -> Model:
     """n = 2, p = q = 1, stable."""
     return _model([[0.9, 0.1], [-0.1, 0.8]], [[-1.0], [1.0]], [[0.0, 1.0]], [[1.0, 0.2], [0.2, 2.0]], [[1.0]], control)
 
 
-def three(control: Chain) -> Model:
+def three(control: LossModel) -> Model:
     """n = 3, p = q = 2, one unstable eigenvalue."""
     a = [[1.05, 0.3, 0.0], [0.0, 0.8, -0.2], [0.0, 0.3, 0.7]]
     b = [[1.0, 0.0], [0.5, -1.0], [0.0, 2.0]]
@@ -92,8 +95,8 @@ def simulated(name: str, model: Model, *, steps: int, lanes: int, seed: int, arr
     """u of size 2 or so; arrivals: None for those of the model's chain, else the same at every step."""
     rng = np.random.default_rng(seed)
     u = 2.0 + rng.normal(size=(steps, lanes, model.q))
-    nu = _losses(rng, model.control, steps, lanes)
-    arrived = _losses(rng, model.observation, steps, lanes).astype(np.bool_)
+    nu = _fates(rng, model.law, steps, lanes)
+    arrived = _fates(rng, law_of(model.observation), steps, lanes).astype(np.bool_)
     if arrivals is not None:
         arrived[:] = arrivals
     w = _normal(rng, model.Q, (steps, lanes))
@@ -111,7 +114,7 @@ def without_control(model: Model) -> Model:
     return replace(model, B=None, control=Chain.lossless())
 
 
-def _model(a: Any, b: Any, c: Any, q: Any, r: Any, control: Chain) -> Model:
+def _model(a: Any, b: Any, c: Any, q: Any, r: Any, control: LossModel) -> Model:
     n = len(a)
     A, B, C, Q, R = (np.array(matrix, dtype=np.float64) for matrix in (a, b, c, q, r))
     P0 = np.eye(n) + 0.25 * np.ones((n, n))
@@ -120,12 +123,13 @@ def _model(a: Any, b: Any, c: Any, q: Any, r: Any, control: Chain) -> Model:
     )
 
 
-def _losses(rng: np.random.Generator, chain: Chain, steps: int, lanes: int) -> NDArray[np.int64]:
-    out = np.empty((steps, lanes), dtype=np.int64)
-    last: NDArray[np.bool_] | None = None
+def _fates(rng: np.random.Generator, law: Law, steps: int, lanes: int) -> NDArray[np.int64]:
+    """1 where a packet arrives, (K, M)."""
+    out, weights = np.empty((steps, lanes), dtype=np.int64), np.tile(law.initial, (lanes, 1))
     for k in range(steps):
-        last = rng.random(lanes) < chain.arrival_given(last)
-        out[k] = last
+        state = (rng.random((lanes, 1)) > weights.cumsum(axis=1)).sum(axis=1)
+        state = np.minimum(state, len(law.initial) - 1)
+        out[k], weights = law.arrived[state], law.transition[state]
     return out
 
 

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from testbed.channel.loss import Chain
-from testbed.conformance.cases import BERNOULLI, MARKOV, Case, one, simulated, three, two
-from testbed.conformance.result import Failed
+from testbed.conformance.cases import BERNOULLI, HIDDEN, MARKOV, Case, one, simulated, three, two
+from testbed.conformance.result import Failed, Skipped
 from testbed.errors import UsageError
 from testbed.estimator.errors import MissingAck
-from testbed.estimator.model import Estimator
+from testbed.estimator.model import Estimator, Model
 from testbed.numerics.lanes import Floats
 
 STEPS = 9
+GILBERT_ELLIOTT = "n = 2, Gilbert–Elliott"
 IN_TIME = (0,)
 """Delays of ACKs: each comes with the step in which its packet counts."""
 
@@ -94,7 +95,7 @@ class Subject:
 
     @cached_property
     def cases(self) -> list[Case]:
-        """Of three systems those that the estimator takes; the first has one lane."""
+        """Those that the estimator takes; the first has one lane."""
         return [case for case in self._all_cases if case.name not in self.refused]
 
     @cached_property
@@ -110,13 +111,24 @@ class Subject:
                     raise
         return refused
 
+    def small(self) -> dict[str, Model]:
+        """The systems with one and two states, of those that it takes. Raises Skipped where it takes none of them."""
+        models = {"n = 1": one(self.control), "n = 2": two(self.control)}
+        taken = {name: model for name, model in models.items() if name not in self.refused}
+        if not taken:
+            raise Skipped("it refuses systems with one and two states")
+        return taken
+
     @cached_property
     def _all_cases(self) -> list[Case]:
-        return [
+        out = [
             simulated("n = 1", one(self.control), steps=STEPS, lanes=1, seed=1),
             simulated("n = 2", two(self.control), steps=STEPS, lanes=3, seed=2),
             simulated("n = 3", three(self.control), steps=STEPS, lanes=3, seed=3),
         ]
+        if self.control is MARKOV:
+            out.append(simulated(GILBERT_ELLIOTT, two(HIDDEN), steps=STEPS, lanes=3, seed=4))
+        return out
 
     @cached_property
     def runs(self) -> list[Run]:

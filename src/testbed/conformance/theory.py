@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from testbed.conformance.cases import Case, one, simulated, two
+from testbed.conformance.cases import Case, simulated
 from testbed.conformance.compare import distance, ratio, smallest_eigenvalue
 from testbed.conformance.form import ROUNDING
 from testbed.conformance.result import Failed
@@ -12,6 +12,7 @@ from testbed.conformance.subject import IN_TIME, Run, Subject
 from testbed.estimator.bounds import Bounds
 from testbed.estimator.errors import TooManyHistories
 from testbed.estimator.kfio import Kfio
+from testbed.estimator.model import Model
 from testbed.numerics.lanes import Floats
 
 EXACT = 1e-8
@@ -108,20 +109,20 @@ def consistency(subject: Subject) -> str:
 
 def long_losses(subject: Subject) -> str:
     """hundreds of lost observations: finite, P not below the covariance with every ACK, and back afterwards"""
-    worst = min(_through(subject, LOST, name, IN_TIME) for name in ("n = 1", "n = 2"))
+    systems = subject.small()
+    worst = min(_through(subject, LOST, name, model, IN_TIME) for name, model in systems.items())
     texts = [f"{LOST} lost in a row with every ACK"]
     if not subject.delays:
         try:
-            worst = min(worst, *(_through(subject, LOST_BLIND, name, ()) for name in ("n = 1", "n = 2")))
+            worst = min(worst, *(_through(subject, LOST_BLIND, name, model, ()) for name, model in systems.items()))
             texts.append(f"{LOST_BLIND} with none")
         except TooManyHistories:
             texts.append(f"{LOST_BLIND} with none are more than it can enumerate")
     return f"{', '.join(texts)}: P at least {worst:.3g} times the covariance with every ACK"
 
 
-def _through(subject: Subject, lost: int, name: str, delays: tuple[int, ...]) -> float:
+def _through(subject: Subject, lost: int, name: str, model: Model, delays: tuple[int, ...]) -> float:
     """The smallest ratio of P to the covariance with every ACK on the way through ``lost`` losses."""
-    model = {"n = 1": one, "n = 2": two}[name](subject.control)
     case = simulated(name, model, steps=lost + 6, lanes=2, seed=7, arrivals=True)
     case.arrived[3 : lost + 3] = False
     case.y[3 : lost + 3] = 0.0
@@ -143,10 +144,8 @@ def _through(subject: Subject, lost: int, name: str, delays: tuple[int, ...]) ->
 
 
 def _many(subject: Subject) -> list[Case]:
-    return [
-        simulated("n = 1", one(subject.control), steps=8, lanes=_LANES, seed=11),
-        simulated("n = 2", two(subject.control), steps=8, lanes=_LANES, seed=12),
-    ]
+    models = subject.small().items()
+    return [simulated(name, model, steps=8, lanes=_LANES, seed=11 + model.n) for name, model in models]
 
 
 def _lower(case: Case) -> Floats:

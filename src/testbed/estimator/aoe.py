@@ -1,6 +1,7 @@
 """AOE: the approximate optimal estimator for unacknowledged Markov control losses (M Theorem 2, theory.md 3.4).
 
-For i.i.d. control losses it is the same estimator as GPB1 and IMM.
+For i.i.d. control losses it is the same estimator as GPB1 and IMM. For Gilbert–Elliott losses the posterior is that of
+the hidden state; there are still two hypotheses a step, since only ν moves the plant.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
-from testbed.channel.law import law_of
 from testbed.estimator.model import Ack, Estimate, Model, newest_ack
 from testbed.estimator.riccati import Gain, log_odds, phi, predict
 from testbed.estimator.state import Given, State, last_law, start_of, state_of
@@ -38,11 +38,11 @@ from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 _Weights = tuple[Component, Component]
-"""Posterior of ν = 0 and of ν = 1, each kept to full relative accuracy."""
+"""Of ν = 0 and of ν = 1, each kept to full relative accuracy."""
 
 
 class Aoe:
-    """One Gaussian and the posterior of the last ν; two hypotheses a step, merged by their moments."""
+    """One Gaussian and the posterior of the last state of the losses; two hypotheses a step, merged by moments."""
 
     STATE_VERSION: ClassVar[int] = 1
 
@@ -50,7 +50,10 @@ class Aoe:
         self._model, self._lanes = model, lanes
         self._advance = _stepper(model, lanes)
         self._x, self._p = model.prior(lanes)
-        self._posterior: _Weights | None = None  # of the last ν
+        self._moves: list[list[float]] = model.law.transition.T.tolist()
+        self._visible = model.law.visible
+        self._among = model.law.states_of(False), model.law.states_of(True)
+        self._states: list[Component] | None = None  # posterior of the last state of the losses
         self._k = 0
         self.counters: dict[str, int] = {}
 
@@ -58,44 +61,65 @@ class Aoe:
         """An ACK of ν_{k−1} decides between the hypotheses; older ones come too late and are counted."""
         gamma = mask_of(arrived)
         self._k += 1
-        weights = self._prior_weights(acks)
-        self._x, self._p, *posterior = self._advance(gamma, self._x, self._p, *weights, vector_of(u), vector_of(y))
-        self._posterior = posterior[0], posterior[1]
+        states = self._prior()
+        weights = self._by_fate(states)
+        known = self._decided(weights, acks)
+        self._x, self._p, *posterior = self._advance(gamma, self._x, self._p, *known, vector_of(u), vector_of(y))
+        self._states = self._shared(states, weights, (posterior[0], posterior[1]))
         return Estimate(self._x, self._p, self._lanes)
 
     def state(self) -> State:
-        """Without ``lost`` and ``delivered``, the posterior of the last ν, before the first step."""
-        posterior = {} if self._posterior is None else dict(zip(("lost", "delivered"), self._posterior, strict=True))
-        return state_of(self._k, self._lanes, {"x": self._x, "P": self._p, **posterior})
+        """``state0``, ``state1``, …: the posterior of the last state of the losses, from the first step on."""
+        known = {} if self._states is None else {f"state{h}": weight for h, weight in enumerate(self._states)}
+        return state_of(self._k, self._lanes, {"x": self._x, "P": self._p, **known})
 
     def set_state(self, state: State) -> None:
         given = Given(state, self._lanes, self._model.n)
         x, p = given.vector("x"), given.matrix("P")
-        posterior = (given.component("lost"), given.component("delivered")) if given.step else None
+        states = [given.component(f"state{h}") for h in range(len(self._model.law.arrived))] if given.step else None
         given.end()
-        self._k, self._x, self._p, self._posterior = given.step, x, p, posterior
+        self._k, self._x, self._p, self._states = given.step, x, p, states
 
     def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
         self._x, self._p = start_of(step, x_hat, P, self._lanes, self._model.n)
-        self._k, self._posterior = step, None
+        self._k, self._states = step, None
         if step:
-            lost, delivered = last_law(law_of(self._model.control), step)
-            self._posterior = full(lost, self._lanes), full(delivered, self._lanes)
+            self._states = [full(float(weight), self._lanes) for weight in last_law(self._model.law, step)]
 
-    def _prior_weights(self, acks: tuple[Ack, ...]) -> _Weights:
-        """P(ν_{k−1} = 0) and P(ν_{k−1} = 1) before y_k, with the ACK of it if one came."""
-        chain, last = self._model.control, self._posterior
+    def _prior(self) -> list[Component]:
+        """P(state of packet k − 1), given what came before."""
+        last = self._states
         if last is None:
-            weights = full(1.0 - chain.start, self._lanes), full(chain.start, self._lanes)
-        else:
-            weights = (
-                (1.0 - chain.recovery) * last[0] + chain.failure * last[1],
-                chain.recovery * last[0] + (1.0 - chain.failure) * last[1],
-            )
+            return [full(float(start), self._lanes) for start in self._model.law.initial]
+        if self._visible:
+            return [column[0] * last[0] + column[1] * last[1] for column in self._moves]
+        return [_sum([move * weight for move, weight in zip(column, last, strict=True)]) for column in self._moves]
+
+    def _by_fate(self, states: list[Component]) -> _Weights:
+        if self._visible:
+            return states[0], states[1]
+        lost, delivered = self._among
+        return _sum([states[h] for h in lost]), _sum([states[h] for h in delivered])
+
+    def _decided(self, weights: _Weights, acks: tuple[Ack, ...]) -> _Weights:
+        """P(ν_{k−1} = 0) and P(ν_{k−1} = 1) before y_k, with the ACK of it if one came."""
         ack = newest_ack(acks, self._k - 1, self.counters)
         if ack is None:
             return weights
         return where(ack[0], 1.0 - ack[1], weights[0]), where(ack[0], ack[1], weights[1])
+
+    def _shared(self, states: list[Component], before: _Weights, after: _Weights) -> list[Component]:
+        """The posterior of ν shared out among the states of each fate, of which y_k and the ACK say nothing.
+
+        A fate of several states has ``before`` > 0, since each of the channel's states can give it.
+        """
+        if self._visible:
+            return list(after)
+        shared = list(states)
+        for among, had, has in zip(self._among, before, after, strict=True):
+            for h in among:
+                shared[h] = has if len(among) == 1 else states[h] * (has / had)
+        return shared
 
 
 def _advance(
@@ -122,6 +146,13 @@ def _advance(
 def _stepper(model: Model, lanes: int) -> Step:
     state: tuple[Shape, ...] = (("vector", model.n), ("symmetric", model.n), ("scalar", 1), ("scalar", 1))
     return masked_step(partial(_advance, model), (*state, ("vector", model.q), ("vector", model.p)), state, lanes)
+
+
+def _sum(terms: list[Component]) -> Component:
+    whole = terms[0]
+    for term in terms[1:]:
+        whole = whole + term
+    return whole
 
 
 def _bayes(weights: _Weights, odds: Component) -> _Weights:

@@ -21,7 +21,7 @@ ROLE = "bounds"
 
 
 class BoundsService:
-    """Publishes the traces of Pᴬ_k and S_k of every lane, and under Markov control losses of the correlated S_k."""
+    """Publishes the traces of Pᴬ_k and S_k of every lane, and under correlated control losses of the correlated S_k."""
 
     def __init__(self, node: Node, setup: Setup) -> None:
         model, bound = model_of(setup.scenario), control_bound(setup.scenario)

@@ -37,7 +37,7 @@ class Ff:
 
     def __init__(self, model: Model, lanes: int) -> None:
         if not model.control.independent:
-            raise UsageError("estimator 'ff' holds for i.i.d. control losses only; for Markov losses use 'aoe' or 'oe'")
+            raise UsageError("estimator 'ff' holds for i.i.d. control losses only; for others use 'aoe' or 'oe'")
         self._model, self._lanes = model, lanes
         self._advance = _stepper(model, lanes)
         self._x, self._p = model.prior(lanes)

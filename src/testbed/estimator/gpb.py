@@ -10,11 +10,11 @@ import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from testbed.channel.law import law_of
-from testbed.estimator.mixtures import IMPOSSIBLE, merged, score_of, share, start_scores, transition_scores
+from testbed.estimator.fates import fates_of
+from testbed.estimator.mixtures import IMPOSSIBLE, Part, all_merged
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.riccati import Gain, log_odds, phi, predict
-from testbed.estimator.state import Given, State, last_law, start_of
+from testbed.estimator.state import Given, State, start_of
 from testbed.numerics.kernels import LANES_MIN
 from testbed.numerics.lanes import (
     Component,
@@ -35,8 +35,6 @@ from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 MAX_ORDER = 12
-_Gaussian = tuple[Vector, Matrix, Component]
-"""Mean, covariance and score."""
 
 
 class Gpb:
@@ -57,7 +55,7 @@ class Gpb:
         self._p = symmetric(model.n, lambda i, j: np.full(lanes, float(model.P0[i, j])))
         self._score: Floats = np.zeros(lanes)
         self._bits = 0  # told apart
-        self._posterior: tuple[Floats, Floats] | None = None  # scores of the last ν while no bit is told apart
+        self._fates = fates_of(model.law)
         self._k = 0
         self.counters: dict[str, int] = {}
 
@@ -68,7 +66,6 @@ class Gpb:
         for ack in acks:
             self._learn(ack)
         priors = self._priors(acks)
-        self._posterior = None
         size = len(self._score)
         shift = model.control_effect(_repeated(u, size)) if model.q else [np.zeros(size)] * model.n
         mask = np.tile(np.asarray(arrived, dtype=np.bool_), size // self._lanes)
@@ -83,6 +80,7 @@ class Gpb:
         self._p = symmetric(model.n, lambda i, j: np.concatenate([covariance[i][j]] * 2))
         self._score = np.concatenate(scores)
         self._bits += 1
+        self._fates.branch()
         self._level()
         estimate = self._moments()
         if self._bits > self._order:
@@ -90,9 +88,8 @@ class Gpb:
         return estimate
 
     def state(self) -> State:
-        """x (n, S), P (n, n, S), score (S,), S = 2^bits · M; the scores of the last ν where no bit is told apart."""
-        posterior = {} if self._posterior is None else dict(zip(("lost", "delivered"), self._posterior, strict=True))
-        arrays = {"x": self._x, "P": self._p, "score": self._score, **posterior}
+        """x (n, S), P (n, n, S), score (S,), S = 2^bits · M, and what is known of the fate of the next packet."""
+        arrays = {"x": self._x, "P": self._p, "score": self._score, **self._fates.state()}
         numbers = {"k": self._k, "bits": self._bits}
         return {name: np.array(value, dtype=np.int64) for name, value in numbers.items()} | {
             name: np.array(value) for name, value in arrays.items()
@@ -104,21 +101,18 @@ class Gpb:
         bits = given.integer("bits", min(given.step, self._order))
         size = lanes * 2**bits
         x, p = given.array("x", np.float64, n, size), given.array("P", np.float64, n, n, size)
-        score, posterior = given.array("score", np.float64, size), None
-        if given.step and not bits:
-            posterior = given.array("lost", np.float64, lanes), given.array("delivered", np.float64, lanes)
+        score, fates = given.array("score", np.float64, size), fates_of(self._model.law)
+        fates.set_state(given, bits, lanes)
         given.end()
-        self._k, self._bits, self._score, self._posterior = given.step, bits, score, posterior
+        self._k, self._bits, self._score, self._fates = given.step, bits, score, fates
         self._x, self._p = list(x), symmetric(n, lambda i, j: p[i, j])
 
     def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
         n, lanes = self._model.n, self._lanes
         start_of(step, x_hat, P, lanes, n)
         self._x, self._p = [x_hat[:, i].copy() for i in range(n)], symmetric(n, lambda i, j: P[:, i, j].copy())
-        self._k, self._bits, self._score, self._posterior = step, 0, np.zeros(lanes), None
-        if step:
-            lost, delivered = (np.full(lanes, score_of(w)) for w in last_law(law_of(self._model.control), step))
-            self._posterior = lost, delivered
+        self._k, self._bits, self._score = step, 0, np.zeros(lanes)
+        self._fates.start_from(step, lanes)
 
     def _learn(self, ack: Ack) -> None:
         """Bar the hypotheses that an ACK of an older packet contradicts."""
@@ -134,15 +128,8 @@ class Gpb:
 
     def _priors(self, acks: tuple[Ack, ...]) -> list[Floats]:
         """log P(ν_{k−1} = 0 | hypothesis) and log P(ν_{k−1} = 1 | hypothesis), with the ACK of it if one came."""
-        chain, size = self._model.control, len(self._score)
-        rows = transition_scores(chain)
-        if self._k == 1:
-            priors = [np.full(size, score) for score in start_scores(chain)]
-        elif self._posterior is not None:
-            last = self._posterior
-            priors = [share(last[0] + rows[0][nu], last[1] + rows[1][nu])[2] for nu in (0, 1)]
-        else:
-            priors = [np.repeat([rows[0][nu], rows[1][nu]], size // 2) for nu in (0, 1)]
+        size = len(self._score)
+        priors = self._fates.priors(size)
         for ack in acks:
             if ack.j == self._k - 1:
                 for nu in (0, 1):
@@ -156,10 +143,9 @@ class Gpb:
 
     def _forget(self) -> None:
         """Merge the pairs that differ in the oldest bit alone."""
-        if self._order == 0:
-            self._posterior = self._score[: self._lanes], self._score[self._lanes :]
         every = self._x, self._p, self._score
         even, odd = (_mapped(partial(_oldest, bit=bit, lanes=self._lanes), every) for bit in (0, 1))
+        self._fates.merge(even[2], odd[2], self._lanes)
         self._x, self._p, self._score = _pairs_merged(self._model, even, odd)
         self._bits -= 1
 
@@ -195,9 +181,8 @@ def _advance(
     return idle, add(idle, shift), phi(covariance, gain, gamma), lost, delivered
 
 
-def _merge(x: Vector, P: Matrix, score: Component, z: Vector, R: Matrix, other: Component) -> _Gaussian:
-    *weights, both = share(score, other)
-    return (*merged((weights[0], weights[1]), (x, P), (z, R)), both)
+def _merge(x: Vector, P: Matrix, score: Component, z: Vector, R: Matrix, other: Component) -> Part:
+    return all_merged([(x, P, score), (z, R, other)])
 
 
 def _shapes(model: Model) -> tuple[Shape, ...]:
@@ -219,7 +204,7 @@ def _merger(model: Model, lanes: int) -> Callable[..., tuple[Any, ...]]:
     return many_lanes(_merge, (*shapes, *shapes), shapes, lanes)
 
 
-def _pairs_merged(model: Model, first: _Gaussian, second: _Gaussian) -> _Gaussian:
+def _pairs_merged(model: Model, first: Part, second: Part) -> Part:
     x, p, score = _merger(model, _kind(len(first[2])))(*first, *second)
     return x, p, score
 

@@ -101,7 +101,7 @@ class Kfio:
         return nu
 
 
-def _advance(
+def advance(
     model: Model, gamma: Mask, x: Vector, P: Matrix, push: Vector, nu: Component, y: Vector
 ) -> tuple[Vector, Matrix]:
     """One step from x̂ and P, with push = B u and known ν."""
@@ -116,7 +116,7 @@ def _advance(
 def _stepper(model: Model, lanes: int) -> Step:
     state: tuple[Shape, ...] = (("vector", model.n), ("symmetric", model.n))
     given: tuple[Shape, ...] = (("vector", model.n), ("scalar", 1), ("vector", model.p))
-    return masked_step(partial(_advance, model), (*state, *given), state, lanes)
+    return masked_step(partial(advance, model), (*state, *given), state, lanes)
 
 
 def _zero(source: Input | None) -> bool:

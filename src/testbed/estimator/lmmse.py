@@ -37,8 +37,7 @@ class Lmmse:
     def __init__(self, model: Model, lanes: int) -> None:
         if not model.control.independent:
             raise UsageError(
-                "estimator 'lmmse' holds for i.i.d. control losses only; for Markov losses use 'aoe', 'gpb', 'imm' or "
-                "'oe'"
+                "estimator 'lmmse' holds for i.i.d. control losses only; for others use 'aoe', 'gpb', 'imm' or 'oe'"
             )
         self._model, self._lanes = model, lanes
         self._advance = _stepper(model, lanes)

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.channel.law import Law, LossModel, law_of
 from testbed.channel.loss import Chain
 from testbed.numerics.lanes import (
     Component,
@@ -45,8 +46,8 @@ class Model:
     x0_mean: Floats
     P0: Floats
     B: Floats | None = None
-    control: Chain = field(default_factory=Chain.lossless)
-    observation: Chain = field(default_factory=Chain.lossless)
+    control: LossModel = field(default_factory=Chain.lossless)
+    observation: LossModel = field(default_factory=Chain.lossless)
     G: Floats | None = None
     W: Floats | None = None
     dA: tuple[Floats, ...] = ()
@@ -64,6 +65,11 @@ class Model:
     @property
     def q(self) -> int:
         return 0 if self.B is None else int(self.B.shape[1])
+
+    @cached_property
+    def law(self) -> Law:
+        """The hidden chain behind ν_0, ν_1, …"""
+        return law_of(self.control)
 
     @cached_property
     def a(self) -> Constant:
@@ -105,7 +111,7 @@ class Ack:
     known: NDArray[Any]
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Estimate:
     """x_hat (M, n) and P (M, n, n) at one step, from components."""
 
@@ -184,7 +190,7 @@ def seen(estimator: Estimator, arrived: NDArray[Any], received: NDArray[Any]) ->
 def expected_nu(model: Model, acks: tuple[Ack, ...], j: int, counters: dict[str, int]) -> Component:
     """E[ν_j] under i.i.d. control losses: the arrival rate, or ν_j itself where an ACK of it came in time."""
     ack = newest_ack(acks, j, counters)
-    rate = model.control.start
+    rate = model.control.first_arrival
     return rate if ack is None else where(ack[0], ack[1], rate)
 
 

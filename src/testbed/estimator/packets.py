@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from testbed.errors import RunFailed, TestbedError, UsageError
 from testbed.estimator.model import Ack, Estimator, Model, seen
+from testbed.estimator.refilter import LateObservation, Refilter
 
 Bit = Annotated[int, Field(ge=0, le=1)]
 
@@ -30,6 +31,10 @@ class PacketLine(BaseModel):
     acks: Annotated[
         list[tuple[Annotated[int, Field(ge=0)], Bit]] | None,
         Field(description="[j, ν_j] that became known at this step"),
+    ] = None
+    late: Annotated[
+        list[tuple[Annotated[int, Field(ge=1)], list[FiniteFloat]]] | None,
+        Field(description="[j, y_j] of earlier steps j that came since the last step"),
     ] = None
 
 
@@ -64,26 +69,38 @@ def _check(line: PacketLine, expected: int, model: Model) -> None:
     for j, _ in line.acks or ():
         if j >= line.k:
             raise UsageError(f"acks: got control packet {j} at step {line.k}; allowed: 0 … {line.k - 1}")
+    for j, y in line.late or ():
+        if j >= line.k:
+            raise UsageError(f"late: got the observation of step {j} at step {line.k}; allowed: 1 … {line.k - 1}")
+        if len(y) != model.p:
+            raise UsageError(f"late: got {len(y)} numbers; allowed: {model.p}")
 
 
 def replay(
-    estimator: Estimator, model: Model, packets: Iterable[PacketLine], *, use_acks: bool, until: int | None = None
+    estimator: Estimator | Refilter,
+    model: Model,
+    packets: Iterable[PacketLine],
+    *,
+    use_acks: bool,
+    until: int | None = None,
 ) -> Iterator[str]:
-    """Lines of OUT.jsonl: k, x_hat, P, up to step ``until``.
+    """Lines of OUT.jsonl: k, x_hat, P, up to step ``until``. Late observations are for a Refilter.
 
     An estimator with ``takes_noise`` gets a y that carried only noise as one that arrived.
     Raises what the estimator raises, and RunFailed for what is not finite.
     """
+    buffered = estimator if isinstance(estimator, Refilter) else Refilter(estimator, 0)
     for line in packets:
         if until is not None and line.k > until:
             return
         received = np.array([line.y is not None])
-        arrived = seen(estimator, received & (line.gamma != 0), received)
+        arrived = seen(buffered.estimator, received & (line.gamma != 0), received)
         y = line.y if line.y is not None else [0.0] * model.p
         acks = tuple(Ack(j, np.array([nu]), np.array([1])) for j, nu in line.acks or ()) if use_acks else ()
+        late = [LateObservation(j, np.array([y]), np.array([True])) for j, y in line.late or ()]
         try:
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                estimate = estimator.step(np.array([line.u or []]), np.array([y]), arrived, acks)
+                estimate = buffered.step(np.array([line.u or []]), np.array([y]), arrived, acks, late)
                 x_hat, P = estimate.x_hat[0], estimate.P[0]
         except TestbedError as error:
             raise type(error)(f"step {line.k}: {error}") from None

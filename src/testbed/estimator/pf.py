@@ -9,7 +9,8 @@ import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
-from testbed.channel.law import law_of
+from testbed.channel.law import Law
+from testbed.errors import UsageError
 from testbed.estimator.mixtures import IMPOSSIBLE
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.state import Given, State, last_law, start_of
@@ -30,21 +31,25 @@ from testbed.numerics.streams import LaneStream
 
 @dataclass
 class _Cloud:
-    """Particles of one lane: x, n arrays (N,); nu (N,), the last control bits; scores (N,), logarithms of weights."""
+    """Particles of one lane: x, n arrays (N,); states (N,), the last of the losses; scores (N,), logs of weights."""
 
     x: Vector
-    nu: NDArray[np.bool_] | None
+    states: NDArray[np.intp] | None
     scores: Floats
 
 
 class Pf:
-    """``particles`` samples of x and of the last ν in each lane, drawn from the model and weighed by the likelihood.
+    """``particles`` samples of x and of the last state of the control losses in each lane.
 
-    Systematic resampling once the effective number of particles is below half of them. What is drawn depends on
-    ``seed``, the number of the lane and the step alone.
+    They are drawn from the model and weighed by the likelihood; systematic resampling once the effective number of
+    particles is below half of them. What is drawn depends on ``seed``, the number of the lane and the step alone.
     """
 
     STATE_VERSION: ClassVar[int] = 1
+    not_claimed: ClassVar[dict[str, str]] = {
+        "coordinates": "its draws depend on the coordinates",
+        "kfio_with_acks": "its mean and covariance are those of a sample",
+    }
 
     def __init__(
         self,
@@ -88,7 +93,7 @@ class Pf:
         return Estimate(vector_of(x_hat), matrix_of(P), self._lanes)
 
     def state(self) -> State:
-        """x (M, n, N), nu (M, N) from the first step on, scores (M, N), and ``lane``, the number of the first lane."""
+        """x (M, n, N), scores (M, N), from the first step on states (M, N); ``lane``, the number of the first lane."""
         clouds = self._begun()
         out: State = {
             "k": np.array(self._k, dtype=np.int64),
@@ -97,7 +102,7 @@ class Pf:
             "scores": np.array([cloud.scores for cloud in clouds]),
         }
         if self._k:
-            out["nu"] = np.array([cloud.nu for cloud in clouds], dtype=np.uint8)
+            out["states"] = np.array([cloud.states for cloud in clouds], dtype=np.int64)
         return out
 
     def set_state(self, state: State) -> None:
@@ -106,10 +111,15 @@ class Pf:
         first = given.integer("lane", 2**31)
         x = given.array("x", np.float64, lanes, n, particles)
         scores = given.array("scores", np.float64, lanes, particles)
-        nu = given.array("nu", np.uint8, lanes, particles).astype(np.bool_) if given.step else [None] * lanes
+        states: list[NDArray[np.intp] | None] = [None] * lanes
+        if given.step:
+            known, largest = given.array("states", np.int64, lanes, particles), len(self._model.law.arrived) - 1
+            if not ((known >= 0) & (known <= largest)).all():
+                raise UsageError(f"state: 'states' holds what is not one; allowed: 0 … {largest}")
+            states = list(known)
         given.end()
         self._k, self._first = given.step, first
-        self._clouds = [_Cloud(list(x[lane]), nu[lane], scores[lane]) for lane in range(lanes)]
+        self._clouds = [_Cloud(list(x[lane]), states[lane], scores[lane]) for lane in range(lanes)]
 
     def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
         """Draws the particles from N(x̂, P), with streams of their own."""
@@ -119,8 +129,9 @@ class Pf:
         for lane in range(self._lanes):
             cloud = self._cloud(x_hat[lane], P[lane], streams[0], self._first + lane)
             if step:
-                arrived = last_law(law_of(self._model.control), step)[1]
-                cloud.nu = streams[1].uniforms(self._first + lane, step, self._particles) < arrived
+                moves = np.tile(last_law(self._model.law, step), (self._particles, 1))
+                points = streams[1].uniforms(self._first + lane, step, self._particles)
+                cloud.states = _drawn(self._model.law, moves, points)
             self._clouds.append(cloud)
 
     def _begun(self) -> list[_Cloud]:
@@ -156,22 +167,49 @@ class Pf:
     def _move(self, cloud: _Cloud, u: Floats, fate: bool | None, normals: Vector, uniforms: Floats) -> None:
         """Draw ν_{k−1} and x_k from the model; where ν is known, take it and weigh by its probability."""
         model = self._model
-        arrival = np.broadcast_to(model.control.arrival_given(cloud.nu), self._particles)
+        law, points = model.law, uniforms[:-1]
+        rows = law.initial if cloud.states is None else law.transition[cloud.states]
+        moves = np.broadcast_to(rows, (self._particles, len(law.arrived)))
+        arrival = moves[:, law.arrived].sum(axis=1)
         if fate is None:
-            cloud.nu = uniforms[:-1] < arrival
+            cloud.states = _drawn(law, moves, points)
+            nu = law.arrived[cloud.states]
         else:
+            chance = arrival if fate else 1.0 - arrival
             with np.errstate(divide="ignore"):
-                chance = np.log(arrival if fate else 1.0 - arrival)
-            cloud.scores = cloud.scores + np.maximum(chance, IMPOSSIBLE)
-            cloud.nu = np.full(self._particles, fate)
+                cloud.scores = cloud.scores + np.maximum(np.log(chance), IMPOSSIBLE)
+            nu = np.full(self._particles, fate)
+            cloud.states = _among(law, moves, nu, points * chance)
         x = add(constant_times(model.a, cloud.x), constant_times(self._root, normals))
         push = model.control_effect([float(v) for v in u]) if model.q else [0.0] * model.n
-        cloud.x = [m + np.where(cloud.nu, b, 0.0) for m, b in zip(x, push, strict=True)]
+        cloud.x = [m + np.where(nu, b, 0.0) for m, b in zip(x, push, strict=True)]
 
     def _weigh(self, cloud: _Cloud, y: Floats) -> None:
         innovation = subtract([float(v) for v in y], constant_times(self._model.c, cloud.x))
         scores = cloud.scores - 0.5 * self._factor.quadratic(innovation)
         cloud.scores = scores - scores.max()
+
+
+def _drawn(law: Law, moves: Floats, points: Floats) -> NDArray[np.intp]:
+    """The state of each particle: first its fate, then the state; moves (N, H), points (N,) uniform."""
+    arrival = moves[:, law.arrived].sum(axis=1)
+    nu = points < arrival
+    return _among(law, moves, nu, np.where(nu, points, points - arrival))
+
+
+def _among(law: Law, moves: Floats, nu: NDArray[np.bool_], points: Floats) -> NDArray[np.intp]:
+    """The state of each particle among those of its fate: where its point lies on their probabilities, side by side.
+
+    moves (N, H), nu (N,), points (N,) in 0 … P(that fate).
+    """
+    if law.visible:
+        return nu.astype(np.intp)
+    chosen = np.empty(len(nu), dtype=np.intp)
+    for fate in (False, True):
+        among, here = np.array(law.states_of(fate)), nu == fate
+        passed = points[here, None] >= np.cumsum(moves[here][:, among[:-1]], axis=1)
+        chosen[here] = among[passed.sum(axis=1)]
+    return chosen
 
 
 def _moments(x: Vector, weights: Floats) -> tuple[Floats, Floats]:
@@ -191,7 +229,7 @@ def _resample(cloud: _Cloud, weights: Floats, uniform: float) -> None:
     chosen = np.searchsorted(np.cumsum(weights), (uniform + np.arange(count)) / count, side="right")
     chosen = np.minimum(chosen, count - 1)
     cloud.x = [component[chosen] for component in cloud.x]
-    cloud.nu = None if cloud.nu is None else cloud.nu[chosen]
+    cloud.states = None if cloud.states is None else cloud.states[chosen]
     cloud.scores = np.zeros(count)
 
 

@@ -31,7 +31,7 @@ BUILT_IN = {
     "kfio": "testbed.estimator.kfio:Kfio",
     "lmmse": "testbed.estimator.lmmse:Lmmse",
     "oe": "testbed.estimator.oe:Oe",
-    "oe-lattice": "testbed.estimator.lattice:LatticeOe",
+    "oe-exact": "testbed.estimator.oe_exact:OeExact",
     "pf": "testbed.estimator.pf:Pf",
     "rse": "testbed.estimator.rse:Rse",
     "rseio": "testbed.estimator.rseio:Rseio",

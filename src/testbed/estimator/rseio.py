@@ -42,11 +42,16 @@ class Rseio(Kfio):
     KIND: ClassVar[str] = "rseio"
 
     def __init__(self, model: Model, lanes: int, mu: Annotated[float, Gt(0), Le(1)] = 0.8) -> None:
-        self._weight = (1.0 - mu) / mu
+        self.mu = mu
         super().__init__(model, lanes)
 
+    @property
+    def weight(self) -> float:
+        """λ = (1 − μ)/μ."""
+        return (1.0 - self.mu) / self.mu
+
     def _stepper(self) -> Step:
-        return _stepper(self._model, self._weight, self._lanes)
+        return _stepper(self._model, self.weight, self._lanes)
 
 
 @dataclass(frozen=True)
@@ -60,22 +65,27 @@ class _Sensitivity:
     noise: Constant
 
 
-def _sensitivity(model: Model, weight: float) -> _Sensitivity | None:
-    """The derivatives of the innovation by each parameter, without rows of zeros; None where nothing is left."""
+def innovation_derivatives(model: Model) -> tuple[Floats, Floats]:
+    """[S T] (2 p m, n + g) for m parameters, and −col_k[0; dC_k] (2 p m, n): theory.md 3.7; at most no rows."""
     n, p = model.n, model.p
     g = np.eye(n) if model.G is None else model.G
-    noise = model.Q if model.W is None else model.W
-    rows: list[Floats] = []
-    pushes: list[Floats] = []
+    rows: list[Floats] = [np.zeros((0, n + g.shape[1]))]
+    pushes: list[Floats] = [np.zeros((0, n))]
     for k in range(max(len(model.dA), len(model.dG), len(model.dC))):
         d_a = model.dA[k] if model.dA else np.zeros((n, n))
         d_g = model.dG[k] if model.dG else np.zeros(g.shape)
         d_c = model.dC[k] if model.dC else np.zeros((p, n))
         rows += [np.hstack([model.C @ d_a, model.C @ d_g]), np.hstack([d_c @ model.A, d_c @ g])]
         pushes += [np.zeros((p, n)), d_c]
-    if not rows or weight == 0.0:
-        return None
-    h, s = np.sqrt(weight) * np.vstack(rows), -np.sqrt(weight) * np.vstack(pushes)
+    return np.vstack(rows), -np.vstack(pushes)
+
+
+def _sensitivity(model: Model, weight: float) -> _Sensitivity | None:
+    """The derivatives of the innovation by each parameter, without rows of zeros; None where nothing is left."""
+    g = np.eye(model.n) if model.G is None else model.G
+    noise = model.Q if model.W is None else model.W
+    rows, pushes = innovation_derivatives(model)
+    h, s = np.sqrt(weight) * rows, np.sqrt(weight) * pushes
     kept = h.any(axis=1) | s.any(axis=1)
     if not kept.any():
         return None

@@ -107,7 +107,7 @@ class EstimatorService:
         arrived = seen(block.estimator, mask, received)
         estimate = block.estimator.step(parts["u"]["u"], y, arrived, _acks(step, parts.get("ack")))
         x_hat, P = estimate.x_hat, estimate.P
-        if not (all_finite(x_hat.ravel()) and all_finite(P.ravel())):
+        if not (all_finite(x_hat) and all_finite(P)):
             raise RunFailed(f"the estimate of '{self._name}' left the range of floating-point numbers at step {step}")
         arrays = {"x_hat": x_hat, "P": P}
         if estimate.error_bound is not None and estimate.error_bound_P is not None:

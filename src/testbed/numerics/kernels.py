@@ -3,7 +3,7 @@
 numpy does one operation on all lanes after the other; a loop does all operations on one lane, and needs memory only at
 its ends. Only additions, multiplications, divisions, square roots and choices are compiled, without contraction, so
 that nothing is rounded otherwise than by numpy. ``exp`` and ``log`` stay numpy's own: a function is cut into loops
-around them.
+around them (see loops.py).
 """
 
 from __future__ import annotations
@@ -11,15 +11,17 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
+from testbed.numerics.loops import COMPARISONS_MAX, Loop, loops
 from testbed.numerics.symbols import Program, Shape, traced
 
 LANES_MIN = 1024
-"""Lanes from which compiling pays; it takes about half a second a function."""
+"""Lanes from which compiling pays; it takes a second a function of two states, several of four."""
 SWITCH = "TESTBED_KERNELS"
 """Environment variable; ``off`` keeps to numpy."""
 
@@ -43,91 +45,102 @@ def kernel(
     """
     program = traced(function, arguments, results)
     types = dict(zip(program.inputs, program.kinds, strict=True))
-    stages = _stages(program)
-    compiled = [_loop(stage, types) if stage.lines else None for stage in stages]
+    stages = [(stage, [_compiled(loop, types) for loop in stage.loops]) for stage in _stages(program)]
+    used = set(program.outputs).union(*(stage.needs() for stage, _ in stages))
 
     def run(*values: Any) -> tuple[Any, ...]:
         flat = program.flatten(values)
         lanes = max((len(v) for v in flat if isinstance(v, np.ndarray)), default=1)
         columns = zip(program.inputs, flat, program.kinds, strict=True)
-        known = {name: _array(value, lanes, kind) for name, value, kind in columns}
-        for stage, loop in zip(stages, compiled, strict=True):
-            if loop is not None:
-                out = [np.empty(lanes) for _ in stage.outputs]
-                loop(*[known[name] for name in stage.inputs], *out)
-                known.update(zip(stage.outputs, out, strict=True))
-            if stage.after is not None:
-                name, function_name, operand = stage.after
+        known = {name: _array(value, lanes, kind) for name, value, kind in columns if name in used}
+        for stage, codes in stages:
+            for loop, code in zip(stage.loops, codes, strict=True):
+                out = [np.empty(lanes) for _ in loop.outputs]
+                code(*[known[name] for name in loop.inputs], *out)
+                known.update(zip(loop.outputs, out, strict=True))
+            for name, function_name, operand in stage.calls:
                 known[name] = whole[function_name](known[operand])
         return program.unflatten([known.get(name, name) for name in program.outputs])
 
     return run
 
 
+@dataclass
 class _Stage:
-    """One loop: its lines, the names it needs and gives, and the call on whole arrays behind it."""
+    """Loops, and behind them the calls on whole arrays: (name, function, operand)."""
 
-    def __init__(self) -> None:
-        self.lines: list[tuple[str, str]] = []
-        self.inputs: list[str] = []
-        self.outputs: list[str] = []
-        self.after: tuple[str, str, str] | None = None
+    loops: list[Loop]
+    calls: list[tuple[str, str, str]]
+
+    def needs(self) -> set[str]:
+        return {name for loop in self.loops for name in loop.inputs} | {operand for _, _, operand in self.calls}
 
 
 def _stages(program: Program) -> list[_Stage]:
-    stages = [_Stage()]
-    born: dict[str, int] = dict.fromkeys(program.inputs, -1)
+    """Calls that need no other call first, then those that need these, and at last the results.
+
+    Where some loop cannot be made short enough to be vector code, none computes again what an earlier one did.
+    """
+    depths: dict[str, int] = {}
+    calls: list[list[tuple[str, str, str]]] = []
     for name, expression in program.lines:
-        call, _, operand = expression.partition("(")
-        if call in _BETWEEN:
-            stages[-1].after = (name, call, operand.rstrip(")"))
-            _need(stages, born, [operand.rstrip(")")], len(stages))
-            stages.append(_Stage())
-            born[name] = len(stages) - 2  # known to every later stage
-        else:
-            here = len(stages) - 1
-            _need(stages, born, Program.names_in(expression), here)
-            stages[-1].lines.append((name, expression))
-            born[name] = here
-    _need(stages, born, [name for name in program.outputs if name in born], len(stages))
+        depths[name] = max((depths.get(operand, 0) for operand in Program.names_in(expression)), default=0)
+        function, _, operand = expression.partition("(")
+        if function in _BETWEEN:
+            calls += [[]] if depths[name] == len(calls) else []
+            calls[depths[name]].append((name, function, operand.rstrip(")")))
+            depths[name] += 1
+    wanted = [[operand for _, _, operand in level] for level in calls] + [program.outputs]
+    stages = _cut(program, calls, wanted)
+    if all(loop.comparisons <= COMPARISONS_MAX for stage in stages for loop in stage.loops):
+        return stages
+    return _cut(program, calls, [_kept(program, depths, level, names) for level, names in enumerate(wanted)])
+
+
+def _kept(program: Program, depths: Mapping[str, int], level: int, wanted: Sequence[str]) -> list[str]:
+    """What is wanted of a level, and what deeper ones need of it."""
+    deeper = [expression for name, expression in program.lines if depths[name] > level]
+    later = {name for expression in deeper for name in Program.names_in(expression)} | set(program.outputs)
+    return [*wanted, *(name for name, _ in program.lines if depths[name] == level and name in later)]
+
+
+def _cut(
+    program: Program, calls: Sequence[list[tuple[str, str, str]]], wanted: Sequence[Sequence[str]]
+) -> list[_Stage]:
+    known, stages = set(program.inputs), []
+    lines = {name for name, _ in program.lines}
+    for names, behind in zip(wanted, [*calls, []], strict=True):
+        outputs = [name for name in dict.fromkeys(names) if name in lines and name not in known]
+        found = loops(program, outputs, known) if outputs else []
+        stages.append(_Stage(found, list(behind)))
+        known |= {name for loop in found for name in loop.outputs} | {name for name, _, _ in behind}
     return stages
 
 
-def _need(stages: list[_Stage], born: Mapping[str, int], names: Sequence[str], here: int) -> None:
-    """Note which stage gives a name and that stage ``here`` takes it."""
-    for name in names:
-        origin = born[name]
-        if origin == here:
-            continue
-        if origin >= 0 and name not in stages[origin].outputs:
-            after = stages[origin].after
-            if after is None or after[0] != name:
-                stages[origin].outputs.append(name)
-        if here < len(stages) and name not in stages[here].inputs:
-            stages[here].inputs.append(name)
-
-
-def _loop(stage: _Stage, types: Mapping[str, str]) -> Callable[..., None]:
+def _compiled(loop: Loop, types: Mapping[str, str]) -> Callable[..., None]:
+    """A loop on arrays of shape (M,); ``types``: the kinds of the inputs that are no numbers."""
     import numba
 
-    parameters = [f"i_{name}" for name in stage.inputs] + [f"o_{name}" for name in stage.outputs]
-    lines = [f"def loop({', '.join(parameters)}):", f"    for i in range(len({parameters[0]})):"]
-    lines += [f"        {name} = i_{name}[i]" for name in stage.inputs]
-    lines += [f"        {name} = {expression}" for name, expression in stage.lines]
-    lines += [f"        o_{name}[i] = {name}" for name in stage.outputs]
+    namespace = primitives()
+    exec("\n".join(loop.source("loop")), namespace)
+    floats, bits = (numba.types.Array(t, 1, "C", readonly=True) for t in (numba.float64, numba.boolean))
+    signature: list[Any] = [bits if types.get(name) == "mask" else floats for name in loop.inputs]
+    signature += [numba.float64[::1]] * len(loop.outputs)
+    found: Callable[..., None] = numba.njit(numba.void(*signature), error_model="numpy", nogil=True)(namespace["loop"])
+    return found
+
+
+def primitives() -> dict[str, Any]:
+    """The functions of components that are compiled, by name."""
+    import numba
+
     inline = numba.njit(inline="always", error_model="numpy")
-    namespace: dict[str, Any] = {
+    return {
         "sqrt": math.sqrt,
         "reciprocal": inline(_reciprocal),
         "clip": inline(_clip),
         "where": inline(_where),
     }
-    exec("\n".join(lines), namespace)
-    floats, bits = (numba.types.Array(t, 1, "C", readonly=True) for t in (numba.float64, numba.boolean))
-    signature: list[Any] = [bits if types.get(name) == "mask" else floats for name in stage.inputs]
-    signature += [numba.float64[::1]] * len(stage.outputs)
-    found: Callable[..., None] = numba.njit(numba.void(*signature), error_model="numpy", nogil=True)(namespace["loop"])
-    return found
 
 
 def _array(value: Any, lanes: int, kind: str) -> Any:

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from testbed.numerics.kernels import LANES_MIN, available, kernel
 from testbed.numerics.symbols import Shape, Symbol, straight_line
 
-_STRAIGHT_MAX = 8  # order of the largest matrix for which code is written out
+STRAIGHT_MAX = 8
+"""Order of the largest matrix for which code is written out."""
 _LARGEST = float(np.finfo(np.float64).max)
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -248,7 +249,7 @@ def one_lane(
     function: Callable[..., Sequence[Any]], arguments: Sequence[Shape], results: Sequence[Shape]
 ) -> Callable[..., tuple[Any, ...]]:
     """``function`` as straight-line code for one lane, to the same bits; itself where it is too long for that."""
-    if max(n for _, n in arguments) > _STRAIGHT_MAX:
+    if max(n for _, n in arguments) > STRAIGHT_MAX:
         return cast(Callable[..., tuple[Any, ...]], function)
     calls: dict[str, Callable[..., Any]] = {
         "sqrt": sqrt,
@@ -264,7 +265,7 @@ def many_lanes(
     function: Callable[..., Sequence[Any]], arguments: Sequence[Shape], results: Sequence[Shape], lanes: int
 ) -> Callable[..., tuple[Any, ...]]:
     """``function`` for many lanes: compiled where that is possible and pays, to the same bits; else itself."""
-    if lanes < LANES_MIN or max(n for _, n in arguments) > _STRAIGHT_MAX or not available():
+    if lanes < LANES_MIN or max(n for _, n in arguments) > STRAIGHT_MAX or not available():
         return cast(Callable[..., tuple[Any, ...]], function)
     return kernel(function, arguments, results, {"exp": exp, "log": log})
 

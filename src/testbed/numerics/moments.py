@@ -2,14 +2,13 @@
 
 A sum of floating-point numbers depends on the order of its terms. Here the order is fixed by the lanes themselves: they
 are taken in groups of 64 in a row, each group is summed as a whole, whichever packets brought its lanes, and the
-groups are merged in order with exact sums. Within a group the deviations are taken from the group's own mean, and
+groups are merged in order. Within a group the deviations are taken from the group's own mean, and
 groups are merged by the formula of Chan, Golub and LeVeque (The American Statistician 37, 1983), so that nothing
 cancels. A mean is corrected once by the mean of what is left: equal values have exactly their mean and no spread.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,8 @@ import numpy as np
 from testbed.numerics.lanes import Floats
 
 GROUP = 64
+Result = tuple[int, float | None, float | None]
+"""Number of values, their mean, and its standard error."""
 
 
 class LaneMoments:
@@ -51,20 +52,20 @@ class LaneMoments:
                 )
             position += taken
 
-    def result(self, figure: int) -> tuple[int, float | None, float | None]:
-        """(number of values, mean, standard error of the mean); None where there are too few values."""
-        used = self._count[figure] > 0.0
-        count, mean, squares = self._count[figure][used], self._mean[figure][used], self._squares[figure][used]
-        n = count.sum()
-        if n == 0:
-            return 0, None, None
-        with np.errstate(over="ignore", invalid="ignore"):
-            rough = _sum(count * mean) / n
-            centre = rough + _sum(count * (mean - rough)) / n
-            between = count * (mean - centre) * (mean - centre)
-        if n < 2:
-            return int(n), float(centre), None
-        return int(n), float(centre), math.sqrt((_sum(squares) + _sum(between)) / (n * (n - 1)))
+    def results(self) -> list[Result]:
+        """Of each figure; None where there are too few values."""
+        count, mean, squares = self._count, self._mean, self._squares
+        n = count.sum(axis=1)
+        with np.errstate(all="ignore"):
+            rough = (count * mean).sum(axis=1) / n
+            centre = rough + (count * (mean - rough[:, None])).sum(axis=1) / n
+            away = mean - centre[:, None]
+            spread = squares.sum(axis=1) + (count * away * away).sum(axis=1)
+            stderr = np.sqrt(spread / (n * (n - 1.0)))
+        return [
+            (int(k), m if k else None, e if k > 1 else None)
+            for k, m, e in zip(n.tolist(), centre.tolist(), stderr.tolist(), strict=True)
+        ]
 
     def _gather(self, group: int, offset: int, values: Floats, size: int) -> None:
         buffer, filled = self._partial.pop(group, (None, 0))
@@ -96,11 +97,3 @@ class LaneMoments:
 
     def _set(self, at: Any, count: int, mean: Any, squares: Any) -> None:
         self._count[at], self._mean[at], self._squares[at] = count, mean, squares
-
-
-def _sum(values: Floats) -> float:
-    """The correctly rounded sum; infinite where it overflows."""
-    try:
-        return math.fsum(values.tolist())
-    except (OverflowError, ValueError):
-        return math.inf

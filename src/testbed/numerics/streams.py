@@ -13,15 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.numerics.circle import place
 from testbed.numerics.lanes import Floats, Vector
 
 TILE = 16
 _FEW = 64  # lanes up to which a whole tile is transformed at once
+_FEWER = 4  # lanes up to which that is done for several tiles
+_TILES = 8
 
 
 @dataclass
-class _Tile:
-    """Random words of TILE steps, and what a law made of them."""
+class _Ahead:
+    """Random words of some steps, and what a law made of them."""
 
     number: int
     raw: NDArray[np.uint64]
@@ -38,7 +41,8 @@ class Stream:
     def __init__(self, seed: int, component: str, purpose: str, *, width: int, lane: int, lanes: int) -> None:
         self._key = _key(seed, component, purpose)
         self._width, self._lane, self._lanes = width, lane, lanes
-        self._tiles: dict[str, _Tile] = {}
+        self._tiles = _TILES if lanes <= _FEWER else 1
+        self._ahead: dict[str, _Ahead] = {}
 
     def uniforms(self, step: int) -> Vector:
         """``width`` components, uniform on [0, 1)."""
@@ -49,23 +53,25 @@ class Stream:
         return self._row(self._normal, self._width + self._width % 2, step)
 
     def _row(self, law: Callable[[NDArray[np.uint64]], Floats], words: int, step: int) -> Vector:
-        number, offset = divmod(step, TILE)
-        tile = self._tiles.get(law.__name__)
-        if tile is None or tile.number != number:
-            tile = self._tiles[law.__name__] = _Tile(number, self._raw_tile(number, words))
+        number, offset = divmod(step, TILE * self._tiles)
+        ahead = self._ahead.get(law.__name__)
+        if ahead is None or ahead.number != number:
+            tiles = [self._raw_tile(number * self._tiles + i, words) for i in range(self._tiles)]
+            ahead = self._ahead[law.__name__] = _Ahead(number, np.concatenate(tiles) if len(tiles) > 1 else tiles[0])
         if self._lanes > _FEW:
-            return list(law(tile.raw[offset : offset + 1])[0])
-        if tile.rows is None:
-            rows = law(tile.raw)
-            tile.rows = rows[:, :, 0].tolist() if self._lanes == 1 else list(rows)
-        return list(tile.rows[offset])
+            return list(law(ahead.raw[offset : offset + 1])[0])
+        if ahead.rows is None:
+            rows = law(ahead.raw)
+            ahead.rows = rows[:, :, 0].tolist() if self._lanes == 1 else list(rows)
+        return list(ahead.rows[offset])
 
     def _raw_tile(self, number: int, words: int) -> NDArray[np.uint64]:
         """Random words of shape (TILE, words, lanes), 53 bits each."""
         counter = np.array([self._lane * TILE * words // 4, words, number, 0], dtype=np.uint64)
         raw = np.random.Philox(key=self._key, counter=counter).random_raw(self._lanes * TILE * words)
-        raw >>= np.uint64(11)
-        return np.ascontiguousarray(raw.reshape(self._lanes, TILE, words).transpose(1, 2, 0))
+        tile = np.empty((TILE * words, self._lanes), dtype=np.uint64)
+        np.right_shift(raw.reshape(self._lanes, TILE * words).T, np.uint64(11), out=tile)
+        return tile.reshape(TILE, words, self._lanes)
 
     def _uniform(self, raw: NDArray[np.uint64]) -> Floats:
         return _uniform(raw)
@@ -108,16 +114,13 @@ def _uniform(raw: NDArray[np.uint64]) -> Floats:
 
 
 def _normal(raw: NDArray[np.uint64]) -> Floats:
-    """Words (steps, words, lanes), an even number of them, as normals of the same shape."""
-    pairs = raw.shape[1] // 2
-    radius = (raw[:, :pairs] + np.uint64(1)).astype(np.float64)
+    """Words (steps, words, lanes), an even number of them, as normals of the same shape (Box and Muller)."""
+    steps, words, lanes = raw.shape
+    radius = (raw[:, : words // 2] + np.uint64(1)).astype(np.float64)
     radius *= 2.0**-53
     np.log(radius, out=radius)
     radius *= -2.0
     np.sqrt(radius, out=radius)
-    angle = raw[:, pairs:].astype(np.float64)
-    angle *= 2.0 * np.pi * 2.0**-53
-    normals = np.concatenate([np.cos(angle), np.sin(angle, out=angle)], axis=1)
-    normals[:, :pairs] *= radius
-    normals[:, pairs:] *= radius
-    return normals
+    normals = np.empty((2, radius.size))
+    place(np.ascontiguousarray(raw[:, words // 2 :]).ravel(), radius.ravel(), normals[0], normals[1])
+    return normals.reshape(2, steps, words // 2, lanes).swapaxes(0, 1).reshape(steps, words, lanes)

@@ -80,33 +80,33 @@ class Program:
         self._arguments = tuple(shapes)
         out = []
         for shape in shapes:
-            fresh = [f"a{len(self.inputs) + i}" for i in range(_size(shape))]
+            fresh = [f"a{len(self.inputs) + i}" for i in range(size_of(shape))]
             self.inputs += fresh
             self.kinds += [shape[0]] * len(fresh)
-            out.append(_unflat([Symbol(self, name) for name in fresh], shape))
+            out.append(from_components([Symbol(self, name) for name in fresh], shape))
         return out
 
     def give(self, values: Sequence[Any], shapes: Sequence[Shape]) -> None:
         """Note the results."""
         self._results = tuple(shapes)
         for value, shape in zip(values, shapes, strict=True):
-            self.outputs += map(_written, _flat(value, shape))
+            self.outputs += map(_written, to_components(value, shape))
         self._drop_unused()
 
     def flatten(self, values: Sequence[Any]) -> list[Any]:
         """The components of arguments in the order of ``inputs``."""
         flat: list[Any] = []
         for value, shape in zip(values, self._arguments, strict=True):
-            flat += _flat(value, shape)
+            flat += to_components(value, shape)
         return flat
 
     def unflatten(self, flat: Sequence[Any]) -> tuple[Any, ...]:
         """Results from components in the order of ``outputs``; a component that is a text is a constant."""
         out, position = [], 0
         for shape in self._results:
-            size = _size(shape)
+            size = size_of(shape)
             part = [float(v.strip("()")) if isinstance(v, str) else v for v in flat[position : position + size]]
-            out.append(_unflat(part, shape))
+            out.append(from_components(part, shape))
             position += size
         return tuple(out)
 
@@ -146,11 +146,11 @@ def straight_line(
     lines = [f"def compiled({', '.join(values)}):"]
     names = iter(program.inputs)
     for value, shape in zip(values, arguments, strict=True):
-        taken = [next(names) for _ in range(_size(shape))]
+        taken = [next(names) for _ in range(size_of(shape))]
         lines += [f"    {name} = {value}{place}" for name, place in zip(taken, _places(shape), strict=True)]
     lines += [f"    {name} = {expression}" for name, expression in program.lines]
     outputs = iter(program.outputs)
-    given = [_packed([next(outputs) for _ in range(_size(shape))], shape) for shape in results]
+    given = [_packed([next(outputs) for _ in range(size_of(shape))], shape) for shape in results]
     lines.append(f"    return {', '.join(given)},")
     namespace: dict[str, Any] = dict(functions)
     exec("\n".join(lines), namespace)
@@ -159,7 +159,7 @@ def straight_line(
 
 
 def _places(shape: Shape) -> list[str]:
-    """Where the components of an argument are, in the order of ``_flat``."""
+    """Where the components of an argument are, in the order of ``to_components``."""
     kind, n = shape
     if kind in ("scalar", "mask"):
         return [""]
@@ -170,7 +170,7 @@ def _places(shape: Shape) -> list[str]:
 
 def _packed(flat: Sequence[str], shape: Shape) -> str:
     """The expression of a result made of the given components."""
-    return str(_unflat(flat, shape)).replace("'", "")
+    return str(from_components(flat, shape)).replace("'", "")
 
 
 def _written(operand: object) -> str:
@@ -181,12 +181,12 @@ def _written(operand: object) -> str:
     raise TypeError(f"cannot write {type(operand).__name__} into straight-line code")
 
 
-def _size(shape: Shape) -> int:
+def size_of(shape: Shape) -> int:
     kind, n = shape
     return 1 if kind in ("scalar", "mask") else n if kind == "vector" else n * (n + 1) // 2
 
 
-def _flat(value: Any, shape: Shape) -> list[Any]:
+def to_components(value: Any, shape: Shape) -> list[Any]:
     kind, n = shape
     if kind in ("scalar", "mask"):
         return [value]
@@ -195,7 +195,7 @@ def _flat(value: Any, shape: Shape) -> list[Any]:
     return [value[i][j] for i in range(n) for j in range(i, n)]
 
 
-def _unflat(flat: Sequence[Any], shape: Shape) -> Any:
+def from_components(flat: Sequence[Any], shape: Shape) -> Any:
     kind, n = shape
     if kind in ("scalar", "mask"):
         return flat[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.numerics.lanes import Component, Matrix, Vector, matrix_of, vector_of
-from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures
+from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures, prepare
 from testbed.wire.setup import Setup
 
 Arrays = dict[str, NDArray[Any]]
@@ -18,11 +19,12 @@ TRUTH, BOUNDS = "truth", "bounds"
 
 @dataclass
 class _Step:
-    """One step: what is still awaited of each block, and what has come before its truth."""
+    """One step: what has come of it, how much has not, and what has come before its truth."""
 
-    awaited: dict[int, set[str]]
+    parts: frozenset[str]
     outstanding: int
     gate: int
+    come: list[tuple[int, str]] = field(default_factory=list)
     largest: float = 0.0
     truth: dict[int, Vector] = field(default_factory=dict)
     early: dict[int, list[tuple[str, Vector, Matrix]]] = field(default_factory=dict)
@@ -36,7 +38,7 @@ class Collector:
     """
 
     def __init__(self, setup: Setup) -> None:
-        scenario = setup.scenario
+        self._setup, scenario = setup, setup.scenario
         self._blocks = [lane for lane, _ in setup.blocks]
         self._until = {spec.name: spec.until or scenario.steps for spec in scenario.estimators}
         self._last_estimate = max(self._until.values(), default=0)
@@ -51,7 +53,15 @@ class Collector:
         """The largest |x_k| of any lane and entry, at each completed step."""
         self.applied = 0
         """Lane-packets of control that the plant says it applied."""
+        self._series = (*self.estimators.values(), self.bounds)
+        self._ends = sorted({*self._until.values(), scenario.steps})
+        self._parts = [self._parts_at(end) for end in self._ends]
         self._steps: dict[int, _Step] = {}
+
+    def prepare(self) -> None:
+        """What would hold up the first step: make it now."""
+        for lanes in {lanes for _, lanes in self._setup.blocks}:
+            prepare(self._setup.sizes.n, lanes)
 
     @property
     def finished(self) -> bool:
@@ -88,34 +98,40 @@ class Collector:
 
     def awaiting(self) -> str:
         """What the oldest incomplete step still waits for."""
-        step = self.completed + 1
-        awaited = set[str]().union(*self._of(step).awaited.values())
-        return f"step {step}: {', '.join(sorted(awaited))}"
+        record = self._of(self.completed + 1)
+        awaited = {part for lane in self._blocks for part in record.parts if (lane, part) not in record.come}
+        return f"step {self.completed + 1}: {', '.join(sorted(awaited))}"
 
     def _reduce(self, name: str, step: int, lane: int, x: Vector, x_hat: Vector, P: Matrix) -> None:
         self.estimators[name].add(step, lane, error_figures(x, x_hat, P))
 
+    def _parts_at(self, step: int) -> tuple[frozenset[str], int]:
+        """What a block of lanes has at a step, and how many of it are estimates."""
+        names = {self._words[name] for name, until in self._until.items() if step <= until}
+        return frozenset(names | {TRUTH} | ({BOUNDS} if self._with_bounds else set())), len(names)
+
     def _of(self, step: int) -> _Step:
         record = self._steps.get(step)
         if record is None:
-            names = {self._words[name] for name, until in self._until.items() if step <= until}
-            parts = names | {TRUTH} | ({BOUNDS} if self._with_bounds else set())
+            parts, estimates = self._parts[bisect_left(self._ends, step)]
             blocks = len(self._blocks)
-            awaited = {lane: set(parts) for lane in self._blocks}
-            record = self._steps[step] = _Step(awaited, blocks * len(parts), blocks * len(names))
+            record = _Step(parts, blocks * len(parts), blocks * estimates)
+            self._steps[step] = record
         return record
 
     def _done(self, record: _Step, lane: int, part: str) -> None:
-        record.awaited[lane].discard(part)
+        record.come.append((lane, part))
         record.outstanding -= 1
-        while (following := self._steps.get(self.completed + 1)) is not None and not following.outstanding:
+        steps = self._steps
+        while (following := steps.get(self.completed + 1)) is not None and not following.outstanding:
             self.completed += 1
-            del self._steps[self.completed]
+            del steps[self.completed]
             self.largest_state.append(following.largest)
-            for series in (*self.estimators.values(), self.bounds):
+            for series in self._series:
                 series.close(self.completed)
-        self.estimated = max(self.estimated, self.completed)
-        while (following := self._steps.get(self.estimated + 1)) is not None and self._estimated(following):
+        if self.estimated < self.completed:
+            self.estimated = self.completed
+        while (following := steps.get(self.estimated + 1)) is not None and self._estimated(following):
             self.estimated += 1
 
     def _estimated(self, record: _Step) -> bool:

@@ -52,7 +52,7 @@ class Conductor:
         self._roles = roles
         self._present: set[str] = set()
         self._granted = 0
-        self._steps, self._window = setup.scenario.steps, setup.window
+        self._steps, self._credit = setup.scenario.steps, setup.credit
         self._stopping = False
         self._recorder = recorder
         self.node = Node(bus, setup.run, ORCHESTRATOR, setup.sizes)
@@ -170,10 +170,10 @@ class Conductor:
         self._advance()
 
     def _advance(self) -> None:
-        """Grant the steps that the window allows, several at a time."""
-        steps, window = self._steps, self._window
-        target = min(steps, self.collector.estimated + window)
-        if target > self._granted and (target == steps or target - self._granted >= max(1, window // 4)):
+        """Grant the steps that may be in flight, several at a time."""
+        steps, credit = self._steps, self._credit
+        target = min(steps, self.collector.estimated + credit)
+        if target > self._granted and (target == steps or target - self._granted >= max(1, credit // 4)):
             self._granted = target
             clock = ClockMessage(run=self.setup.run, source=ORCHESTRATOR, seq=self._clock_seq, step=target)
             self._clock_seq += 1

@@ -12,6 +12,7 @@ from testbed import __version__
 from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.channel.chains import chain_of
+from testbed.channel.gilbert_elliott import GilbertElliott
 from testbed.estimator.bounds import correlation_factor
 from testbed.estimator.service import acks_of, role_of
 from testbed.orchestrator.conductor import Conductor
@@ -84,18 +85,21 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
 
 def moment_checks(scenario: Scenario) -> list[Check]:
     """Whether the EEC and the variance of its sample mean can be finite."""
-    A, chain = np.array(scenario.system.A), chain_of(scenario.links.observation.loss)
-    order, rho = finite_moment_order(A, chain), spectral_radius(A)
-    where = f"ρ(A) = {rho:.6g}, P(arrival after a loss) = {chain.recovery:.6g}"
+    A, losses = np.array(scenario.system.A), chain_of(scenario.links.observation.loss)
+    order, rho, decay = finite_moment_order(A, losses), spectral_radius(A), losses.burst_decay
+    hidden = isinstance(losses, GilbertElliott)
+    burst = f"θ = {decay:.6g}" if hidden else f"P(arrival after a loss) = {losses.recovery:.6g}"
+    where, factor = f"ρ(A) = {rho:.6g}, {burst}", "θ" if hidden else "(1 − recovery)"
     growth = rho * rho  # a power would raise where this is infinite
-    mean = f"ρ²(1 − recovery) = {growth * (1 - chain.recovery):.4g}"
-    variance = f"ρ⁴(1 − recovery) = {growth * growth * (1 - chain.recovery):.4g}"
+    mean = f"ρ²{factor} = {growth * decay:.4g}"
+    variance = f"ρ⁴{factor} = {growth * growth * decay:.4g}"
     if order <= 1.0:
         return [Check(name="finite mean", ok=False, text=f"{where}: {mean} ≥ 1, the EEC diverges")]
     checks = [Check(name="finite mean", ok=True, text=f"{where}: {mean} < 1, necessary for a bounded EEC")]
     if order <= 2.0:
         text = (
-            f"{where}: {variance} ≥ 1, the error covariance has no finite variance in the long run (P Corollary 9): "
+            f"{where}: {variance} ≥ 1, the error covariance has no finite variance in the long run"
+            f"{'' if hidden else ' (P Corollary 9)'}: "
             "standard errors and confidence bands of its mean are not to be trusted, more lanes do not mend that"
         )
         return [*checks, Check(name="finite variance", ok=False, text=text)]

@@ -15,6 +15,7 @@ import numpy as np
 
 from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
 from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.interrupts import Interrupts, noted
 from testbed.orchestrator.outcome import summarise
 from testbed.orchestrator.preflight import check_estimators, prepare_folder
 from testbed.orchestrator.recorder import Recorder
@@ -79,27 +80,25 @@ class Run:
         supervisor = Supervisor(self._out / "logs")
         recorder = self._recorder()
         with ExitStack() as cleanup:
+            interrupts = cleanup.enter_context(noted())
             cleanup.enter_context(closing(session))
             if recorder is not None:
                 cleanup.callback(recorder.close)
             cleanup.callback(supervisor.close, 0.0)
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.window == 1)
             conductor = self._conductor(bus, recorder)
-            interrupted = False
-            try:
-                threading.Thread(target=_import_report, daemon=True).start()
-                for role in self._roles:
-                    if role.name in external:
-                        self._say(f"start {role.name} by hand: {shlex.join(self._by_hand(role, endpoint))}")
-                    else:
-                        supervisor.start(role, endpoint, self._setup.run, transport)
-                with _settled_memory():
-                    self._drive(conductor, bus, supervisor, patient=bool(external))
-            except KeyboardInterrupt:
-                interrupted = True
+            threading.Thread(target=_import_report, daemon=True).start()
+            for role in self._roles:
+                if role.name in external:
+                    self._say(f"start {role.name} by hand: {shlex.join(self._by_hand(role, endpoint))}")
+                else:
+                    supervisor.start(role, endpoint, self._setup.run, transport)
+            conductor.collector.prepare()
+            with _settled_memory():
+                self._drive(conductor, bus, supervisor, interrupts, patient=bool(external))
             self._settle(conductor, bus)
             supervisor.close(_LEAVE_S if conductor.collector.finished else 0.2)
-            return self._finish(conductor, interrupted=interrupted)
+            return self._finish(conductor, interrupted=interrupts.asked)
 
     @np.errstate(all="ignore")
     def in_process(self, schedule: int | None = None) -> Summary:
@@ -107,31 +106,28 @@ class Run:
         network = MemoryNetwork(schedule)
         recorder = self._recorder()
         conductor = self._conductor(network.bus(), recorder)
-        interrupted = False
-        try:
-            nodes: list[tuple[Node, Role]] = []
-            for spec in self._roles:
-                node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.tap)
-                nodes.append((node, spec.build(node, self._setup)))
-                node.announce()
-            while not conductor.over:
-                if not network.step():
-                    conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
-                self._tell(conductor)
-        except KeyboardInterrupt:
-            interrupted = True
-        except TestbedError as error:
-            conductor.fail(str(error))
-        try:
+        nodes: list[tuple[Node, Role]] = []
+        with ExitStack() as cleanup:
+            interrupts = cleanup.enter_context(noted())
+            if recorder is not None:
+                cleanup.callback(recorder.close)
+            try:
+                for spec in self._roles:
+                    node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.tap)
+                    nodes.append((node, spec.build(node, self._setup)))
+                    node.announce()
+                while not conductor.over and not interrupts.asked:
+                    if not network.step():
+                        conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
+                    self._tell(conductor)
+            except TestbedError as error:
+                conductor.fail(str(error))
             conductor.stop()
             _drain(network, lambda: all(node.stopped for node, _ in nodes))
             for node, role in nodes:
                 node.report("stopped", role.counters)
             _drain(network, lambda: conductor.all_reported)
-            return self._finish(conductor, interrupted=interrupted)
-        finally:
-            if recorder is not None:
-                recorder.close()
+            return self._finish(conductor, interrupted=interrupts.asked)
 
     def _conductor(self, bus: object, recorder: Recorder | None) -> Conductor:
         conductor = Conductor(bus, self._setup, [role.name for role in self._roles], recorder)  # type: ignore[arg-type]
@@ -152,11 +148,13 @@ class Run:
     def _by_hand(self, role: RoleSpec, endpoint: str) -> list[str]:
         return command_of(role, endpoint, self._setup.run, self._setup.transport)
 
-    def _drive(self, conductor: Conductor, bus: object, supervisor: Supervisor, *, patient: bool) -> None:
+    def _drive(
+        self, conductor: Conductor, bus: object, supervisor: Supervisor, interrupts: Interrupts, *, patient: bool
+    ) -> None:
         """Until the run is over, has failed, or made no progress for the deadline."""
         deadline_s = self._setup.scenario.transport.deadline_ns / 1e9
         last, since, looked = -1, time.monotonic(), 0.0
-        while not conductor.over:
+        while not conductor.over and not interrupts.asked:
             bus.run(_POLL_S)  # type: ignore[attr-defined]
             now = time.monotonic()
             if now - looked < _POLL_S:

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from testbed.numerics.lanes import Cholesky, Component, Matrix, Vector, dot, many_lanes, one_lane, subtract, trace
-from testbed.numerics.moments import LaneMoments
+from testbed.numerics.moments import LaneMoments, Result
 from testbed.numerics.symbols import Shape
 
 ERROR_FIGURES = ("trace_P", "squared_error", "nees", "excess")
@@ -21,6 +21,11 @@ def error_figures(x: Vector, x_hat: Vector, P: Matrix) -> Figures:
     lanes = 1 if isinstance(x[0], float) else len(x[0])
     compute = _compute(len(x), lanes)
     return dict(zip(ERROR_FIGURES, compute(x, x_hat, P), strict=True))
+
+
+def prepare(n: int, lanes: int) -> None:
+    """Make the code that ``error_figures`` needs for blocks of that many lanes, which may take a second."""
+    _compute(n, lanes)
 
 
 def _figures(x: Vector, x_hat: Vector, P: Matrix) -> tuple[Component, ...]:
@@ -43,10 +48,8 @@ class Series:
 
     def __init__(self, names: tuple[str, ...], lanes: int) -> None:
         self.names, self._lanes = names, lanes
-        self.mean: dict[str, list[float | None]] = {name: [] for name in names}
-        self.stderr: dict[str, list[float | None]] = {name: [] for name in names}
-        self.undefined = 0
-        self._open: dict[int, dict[str, float] | LaneMoments] = {}
+        self._open: dict[int, Figures | LaneMoments] = {}
+        self._closed: list[Figures | list[Result] | None] = []
 
     def add(self, step: int, lane: int, figures: Figures) -> None:
         """Take in the figures of a block of lanes; what is not among them has no value at this step."""
@@ -61,22 +64,41 @@ class Series:
         moments.add(lane, np.array([figures.get(name, absent) for name in self.names]).reshape(len(self.names), -1))
 
     def close(self, step: int) -> None:
-        """The next step is complete: note its figures and forget the sums."""
-        moments = self._open.pop(step, None)
-        for i, name in enumerate(self.names):
-            mean: float | None = None
-            stderr: float | None = None
-            if isinstance(moments, LaneMoments):
-                count, mean, stderr = moments.result(i)
-                if name == "nees":
-                    self.undefined += self._lanes - count
-            elif moments is not None and name in moments:
-                finite = math.isfinite(moments[name])
-                mean = moments[name] if finite else None
-                self.undefined += name == "nees" and not finite
-            self.mean[name].append(mean)
-            self.stderr[name].append(stderr)
+        """The next step is complete: keep its figures and forget the sums."""
+        figures = self._open.pop(step, None)
+        self._closed.append(figures.results() if isinstance(figures, LaneMoments) else figures)
 
+    @property
+    def mean(self) -> dict[str, list[float | None]]:
+        """Of each figure, along the closed steps; None where it has no value."""
+        return {name: [mean for _, mean, _ in results] for name, results in self._results().items()}
+
+    @property
+    def stderr(self) -> dict[str, list[float | None]]:
+        """As ``mean``; None also with one lane."""
+        return {name: [stderr for _, _, stderr in results] for name, results in self._results().items()}
+
+    @property
+    def undefined(self) -> int:
+        """Lane-steps without a NEES."""
+        if "nees" not in self.names:
+            return 0
+        results = self._results()["nees"]
+        there = [result for result, closed in zip(results, self._closed, strict=True) if closed is not None]
+        return self._lanes * len(there) - sum(count for count, _, _ in there)
+
+    def _results(self) -> dict[str, list[Result]]:
+        rows = [[_ABSENT] * len(self.names) if row is None else self._row(row) for row in self._closed]
+        return {name: [row[i] for row in rows] for i, name in enumerate(self.names)}
+
+    def _row(self, closed: Figures | list[Result]) -> list[Result]:
+        if isinstance(closed, list):
+            return closed
+        values = [closed.get(name, math.nan) for name in self.names]
+        return [(1, value, None) if math.isfinite(value) else _ABSENT for value in values]
+
+
+_ABSENT: Result = (0, None, None)
 
 Progress = Callable[[int, int], None]
 """Called with (completed steps, steps)."""

@@ -84,7 +84,7 @@ class BoundFigures(_Model):
     upper_mean: Series | None = None
     upper_stderr: Series | None = None
     upper_correlated_mean: Series | None = Field(
-        default=None, description="S for Markov control losses: with U (1 + |r|)/(1 − |r|), r = 1 − recovery − failure"
+        default=None, description="S with more of U, which holds for correlated control losses"
     )
     upper_correlated_stderr: Series | None = None
     upper_reason: str | None = Field(default=None, description="why there is no valid upper bound")

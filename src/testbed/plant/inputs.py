@@ -20,7 +20,8 @@ from testbed.scenario import (
 )
 
 InputSource = Callable[[int], Floats]
-"""k → u_k of shape (lanes, q), the same for the same k."""
+"""k → u_k of shape (lanes, q), the same for the same k; k < steps."""
+_AHEAD = 256  # steps
 
 
 def open_loop(scenario: Scenario, lane: int, lanes: int) -> InputSource:
@@ -32,8 +33,22 @@ def open_loop(scenario: Scenario, lane: int, lanes: int) -> InputSource:
         stream = Stream(scenario.seed, "controller", "input", width=q, lane=lane, lanes=lanes)
         low, high = _channels(source.low, q), _channels(source.high, q)
         return lambda k: low + (high - low) * array_of(stream.uniforms(k), lanes)
-    law = deterministic(scenario)
-    return lambda k: np.tile(law(np.array([k])), (lanes, 1))
+    return _Ahead(deterministic(scenario), lanes, scenario.steps)
+
+
+class _Ahead:
+    """An input that is the same in every lane, computed many steps at a time."""
+
+    def __init__(self, law: Callable[[NDArray[np.int64]], Floats], lanes: int, steps: int) -> None:
+        self._law, self._lanes, self._steps = law, lanes, steps
+        self._begin, self._rows = 0, np.zeros((0, 1, 0))
+
+    def __call__(self, k: int) -> Floats:
+        if not self._begin <= k < self._begin + len(self._rows):
+            self._begin = k - k % _AHEAD
+            self._rows = self._law(np.arange(self._begin, min(self._begin + _AHEAD, self._steps)))[:, None, :]
+        row: Floats = self._rows[k - self._begin]
+        return row if self._lanes == 1 else np.tile(row, (self._lanes, 1))
 
 
 def deterministic(scenario: Scenario) -> Callable[[NDArray[np.int64]], Floats]:

@@ -35,10 +35,10 @@ class PlantService:
         lane, lanes, step = packet.lane, packet.lanes, packet.step + 1
         applied = mask_of(arrays["mask"])
         x, y = self._plants[lane].move(arrays.get("u"), applied)
-        if not (all_finite(x.ravel()) and all_finite(y.ravel())):
+        if not (all_finite(x) and all_finite(y)):
             raise RunFailed(f"the state left the range of floating-point numbers at step {step}")
         nu = bits(applied)
+        self._observe(step, lane, lanes, {"y": y, "noise": self._plants[lane].noise} if self._noise else {"y": y})
         if self._ack is not None:
             self._ack(step, lane, lanes, {"nu": nu})
         self._truth(step, lane, lanes, {"x": x, "nu": nu})
-        self._observe(step, lane, lanes, {"y": y, "noise": self._plants[lane].noise} if self._noise else {"y": y})

@@ -14,7 +14,17 @@ from testbed.scenario.inputs import (
     TableInput,
     UniformInput,
 )
-from testbed.scenario.links import AckLink, BernoulliLoss, Link, Links, Loss, MarkovLoss, NoLoss, ObservationLink
+from testbed.scenario.links import (
+    AckLink,
+    BernoulliLoss,
+    GilbertElliottLoss,
+    Link,
+    Links,
+    Loss,
+    MarkovLoss,
+    NoLoss,
+    ObservationLink,
+)
 from testbed.scenario.load import load_scenario, parse_scenario
 from testbed.scenario.models import Scenario
 from testbed.scenario.schema import scenario_json_schema
@@ -31,6 +41,7 @@ __all__ = [
     "EstimatorSpec",
     "ExponentialInput",
     "FeedbackInput",
+    "GilbertElliottLoss",
     "Input",
     "Link",
     "Links",

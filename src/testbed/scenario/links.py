@@ -88,6 +88,37 @@ class MarkovLoss(Part):
         return self
 
 
+class GilbertElliottLoss(Part):
+    """The full Gilbert-Elliott channel: a hidden state, good or bad, and a probability of loss in each.
+
+    A packet is lost with the probability of the state that it meets; then the state moves, one move a packet. In the
+    words of `tc netem loss gemodel p r 1-h 1-k`: to_bad = p, to_good = r, loss_bad = 1-h, loss_good = 1-k.
+    """
+
+    kind: Literal["gilbert-elliott"] = Field(default="gilbert-elliott", description="Kind of loss.")
+    to_bad: Probability = Field(description="Probability that a good state is followed by a bad one, 0 … 1.")
+    to_good: Probability = Field(description="Probability that a bad state is followed by a good one, 0 … 1.")
+    loss_good: Probability = Field(
+        default=0.0, description="Probability that a packet is lost in the good state, 0 … loss_bad."
+    )
+    loss_bad: Probability = Field(default=1.0, description="Probability that a packet is lost in the bad state, 0 … 1.")
+    start_good: Probability | None = Field(
+        default=None, description="Probability that the first state is good, 0 … 1; left out: the stationary one."
+    )
+
+    @model_validator(mode="after")
+    def _moves(self) -> "GilbertElliottLoss":
+        if self.to_bad + self.to_good == 0:
+            raise problem("got to_bad 0 and to_good 0; allowed: to_bad + to_good more than 0")
+        if self.loss_good > self.loss_bad:
+            raise problem(
+                f"got {shown(self.loss_good)}; allowed with loss_bad {shown(self.loss_bad)}: "
+                f"0 … {shown(self.loss_bad)}, the bad state being the one that loses more",
+                "loss_good",
+            )
+        return self
+
+
 def _listed(data: dict[str, Any], keys: tuple[str, ...]) -> str:
     return " and ".join(key for key in keys if key in data) or "none of them"
 
@@ -108,7 +139,7 @@ def _rates(loss_given: object, mean_burst_given: object) -> tuple[float, float]:
     return 1 / burst, min(1.0, loss / ((1 - loss) * burst))
 
 
-Loss = Annotated[NoLoss | BernoulliLoss | MarkovLoss, Field(discriminator="kind")]
+Loss = Annotated[NoLoss | BernoulliLoss | MarkovLoss | GilbertElliottLoss, Field(discriminator="kind")]
 
 
 class Link(Part):

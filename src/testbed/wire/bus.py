@@ -8,7 +8,7 @@ from typing import Protocol
 from testbed.errors import TestbedError
 
 Handler = Callable[[str, bytes], None]
-"""Called with (key, payload) of a message."""
+"""Called with (key, payload)."""
 Answer = Callable[[bytes], bytes]
 """Called with a question, returns the answer."""
 PresenceHandler = Callable[[str, bool], None]

@@ -9,14 +9,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
+from testbed.wire.bundle import unbundle
 from testbed.wire.messages import PROTOCOL, ArrayEntry, Message, Packet
 
 MAGIC = b"NCS1"
@@ -25,21 +26,22 @@ _FLOAT = np.dtype("<f8")
 _DTYPES: dict[str, np.dtype[Any]] = {"<f8": _FLOAT, "|u1": np.dtype("u1")}
 _FORMS_MAX = 64
 _FEW = 16  # numbers up to which looking at each in turn is fastest
-_NUMBER = rb"(0|[1-9][0-9]{0,17})"
+_NUMBER = rb" *(0|[1-9][0-9]{0,17})"
 _SEQ = b'"seq":'
+_NUMBERS = re.compile(_NUMBER + rb',"step":' + _NUMBER)
 _VARIABLE = re.compile(
-    _NUMBER + rb',"step":' + _NUMBER + rb',"lane":' + _NUMBER + rb',"lanes":([1-9][0-9]{0,8})(,"arrays":[^{}:]*\}) *'
+    _NUMBERS.pattern + rb',"lane":' + _NUMBER + rb',"lanes":([1-9][0-9]{0,8})(,"arrays":[^{}:]*\}) *'
 )
 """What follows ``"seq":`` in a header as PacketEncoder writes it; what comes before is the same for all on a key.
 
 No key follows ``arrays``: of a key that is there twice the last counts.
 """
 _SMALL = 1024  # bytes up to which copying an array twice costs less than a view of it
-_BLANKS = tuple(b" " * n for n in range(8))
 _PADDING = (b"", b"\0" * 7, b"\0" * 6, b"\0" * 5, b"\0" * 4, b"\0" * 3, b"\0" * 2, b"\0")
 
 M = TypeVar("M", bound=Message)
 Arrays = Mapping[str, NDArray[Any]]
+Content = dict[str, NDArray[Any]]
 
 
 class Rejected(ValueError):
@@ -75,33 +77,54 @@ def encode(message: Message, arrays: Arrays | None = None) -> bytes:
 
 
 class PacketEncoder:
-    """``encode`` for the packets of one type on one key, with the constant part of the header written once."""
+    """``encode`` for the packets of one type on one key, with the constant parts of the header written once.
+
+    The numbers are set off with blanks, so that the packets of a block of lanes all have the same length.
+    """
 
     def __init__(self, model: type[Packet], run: str, source: str) -> None:
         kind = model.model_fields["type"].default
         model.model_validate({"type": kind, "run": run, "source": source, "seq": 0, "step": 0, "lane": 0, "lanes": 1})
-        self._head = f'{{"v":{PROTOCOL},"type":"{kind}","run":"{run}","source":"{source}","seq":'
-        self._tails: dict[tuple[tuple[str, tuple[int, ...]], ...], str] = {}
+        self._head = f'{{"v":{PROTOCOL},"type":"{kind}","run":"{run}","source":"{source}","seq":'.encode()
+        self._parts: dict[tuple[Any, ...], tuple[bytes, bytes]] = {}
 
     def encode(self, seq: int, step: int, lane: int, lanes: int, arrays: Arrays) -> bytes:
         """The payload of one packet; arrays: float64 or uint8."""
-        shapes = tuple([(name, array.shape) for name, array in arrays.items()])
-        tail = self._tails.get(shapes)
-        if tail is None:
-            listed = json.dumps(entries_of(arrays), separators=(",", ":"))
-            tail = self._tails[shapes] = f',"arrays":{listed}}}'
-        return _joined(f'{self._head}{seq},"step":{step},"lane":{lane},"lanes":{lanes}{tail}'.encode(), arrays)
+        numbers = _text(seq, step)
+        form = (len(numbers), lane, lanes, *[(name, array.shape, array.dtype) for name, array in arrays.items()])
+        parts = self._parts.get(form)
+        if parts is None:
+            parts = self._parts[form] = self._written(len(numbers), lane, lanes, arrays)
+        return b"".join([parts[0], numbers, parts[1], *_contents(arrays)])
+
+    def _written(self, width: int, lane: int, lanes: int, arrays: Arrays) -> tuple[bytes, bytes]:
+        """What stands before and behind the numbers."""
+        listed = json.dumps(entries_of(arrays), separators=(",", ":"))
+        tail = f',"lane":{lane},"lanes":{lanes},"arrays":{listed}}}'.encode()
+        length = len(self._head) + width + len(tail)
+        blanks = -length % 8
+        return MAGIC + (length + blanks).to_bytes(4, "little") + self._head, tail + b" " * blanks
 
 
 def _joined(header: bytes, arrays: Arrays) -> bytes:
     blanks = -len(header) % 8
-    pieces: list[bytes | memoryview] = [MAGIC, (len(header) + blanks).to_bytes(4, "little"), header, _BLANKS[blanks]]
+    return b"".join([MAGIC, (len(header) + blanks).to_bytes(4, "little"), header, b" " * blanks, *_contents(arrays)])
+
+
+def _contents(arrays: Arrays) -> list[bytes | memoryview]:
+    """The bytes of the arrays, each padded."""
+    pieces: list[bytes | memoryview] = []
     for array in arrays.values():
-        content = array.tobytes() if array.nbytes < _SMALL or not array.flags.c_contiguous else array.data
-        pieces.append(content)
-        if array.nbytes % 8:
-            pieces.append(_PADDING[array.nbytes % 8])
-    return b"".join(pieces)
+        size = array.nbytes
+        pieces.append(array.tobytes() if size < _SMALL or not array.flags.c_contiguous else array.data)
+        if size % 8:
+            pieces.append(_PADDING[size % 8])
+    return pieces
+
+
+def _text(seq: int, step: int) -> bytes:
+    """How PacketEncoder writes the numbers."""
+    return b'%12d,"step":%12d' % (seq, step)
 
 
 @dataclass(frozen=True)
@@ -132,16 +155,55 @@ class _Form:
     layout: _Layout
 
 
-_set = object.__setattr__
+@dataclass(frozen=True)
+class _Recent:
+    """The last packet that was found valid: what stands before and behind seq and step in it."""
+
+    form: _Form
+    head: bytes
+    tail: bytes
+    tail_at: int
+    end: int
+    """Where the arrays begin."""
+
+    def numbers(self, message: bytes) -> tuple[int, int] | None:
+        """(seq, step) of a message whose header differs from this one in these only."""
+        if not message.startswith(self.head) or not message.startswith(self.tail, self.tail_at):
+            return None
+        match = _NUMBERS.fullmatch(message, len(self.head), self.tail_at)
+        return None if match is None else (int(match[1]), int(match[2]))
+
+    def numbers_of(self, messages: list[bytes]) -> list[tuple[int, int] | None]:
+        """``numbers`` of each: most often both are one more than in the message before."""
+        out: list[tuple[int, int] | None] = []
+        seq, step = self.numbers(messages[0]) or (0, 0)
+        tail, tail_at = self.tail, self.tail_at
+        for message in messages:
+            expected = self.head + _text(seq, step)
+            if message.startswith(expected) and len(expected) == tail_at and message.startswith(tail, tail_at):
+                out.append((seq, step))
+            else:
+                found = self.numbers(message)
+                out.append(found)
+                seq, step = found or (seq, step)
+            seq, step = seq + 1, step + 1
+        return out
+
+
+_new = object.__new__
+_slots = vars(BaseModel)
+_set_values, _set_named = _slots["__dict__"].__set__, _slots["__pydantic_fields_set__"].__set__
+_set_extra, _set_private = _slots["__pydantic_extra__"].__set__, _slots["__pydantic_private__"].__set__
 
 
 def _variant(header: Any, seq: int, step: int, lane: int) -> Any:
     """A valid header with other numbers, which the caller has checked; model_copy takes ten times as long."""
-    out = object.__new__(type(header))
-    _set(out, "__dict__", {**header.__dict__, "seq": seq, "step": step, "lane": lane})
-    _set(out, "__pydantic_fields_set__", header.__pydantic_fields_set__)
-    _set(out, "__pydantic_extra__", None)
-    _set(out, "__pydantic_private__", None)
+    out, values = _new(type(header)), header.__dict__.copy()
+    values["seq"], values["step"], values["lane"] = seq, step, lane
+    _set_values(out, values)
+    _set_named(out, header.__pydantic_fields_set__)
+    _set_extra(out, None)
+    _set_private(out, None)
     return out
 
 
@@ -152,14 +214,41 @@ class Decoder(Generic[M]):
         self._model, self._run, self._sizes = model, run, sizes
         self._validate = model.__pydantic_validator__.validate_json
         self._forms: dict[tuple[bytes | Any, ...], _Form] = {}
+        self._recent: dict[int, _Recent] = {}
         self._required = {name for name, rule in model.ARRAYS.items() if rule.required}
 
-    def decode(self, payload: bytes) -> tuple[M, dict[str, NDArray[Any]]]:
-        """The header and its arrays, read-only views of the payload.
+    def read(self, payload: bytes) -> Iterable[tuple[bytes, tuple[M, Content] | Rejected]]:
+        """The messages of a payload, which may be a bundle, each with what ``decode`` says of it."""
+        messages = unbundle(payload)
+        if len(messages) == 1:
+            return ((payload, self._outcome(payload)),)
+        groups: dict[int, list[int]] = {}
+        for i, message in enumerate(messages):
+            groups.setdefault(len(message), []).append(i)
+        outcomes: list[Any] = [None] * len(messages)
+        for places in groups.values():
+            group = [messages[i] for i in places]
+            for i, outcome in zip(places, self._alike(group) or map(self._outcome, group), strict=True):
+                outcomes[i] = outcome
+        return zip(messages, outcomes, strict=True)
+
+    def _outcome(self, message: bytes) -> tuple[M, Content] | Rejected:
+        try:
+            return self.decode(message)
+        except Rejected as refusal:
+            return refusal
+
+    def decode(self, payload: bytes) -> tuple[M, Content]:
+        """The header of a message and its arrays, read-only views of the payload.
 
         Raises Rejected: not a message, wrong type or version, another run, a step or lane out of range, arrays that the
         type does not have or that lack, wrong shape or length, values that are not finite, masks other than 0 and 1.
         """
+        recent = self._recent.get(len(payload))
+        if recent is not None and (numbers := recent.numbers(payload)) is not None:
+            header = _variant(recent.form.header, *numbers, recent.form.header.lane)
+            self._check_range(header)
+            return header, self._arrays(recent.form.layout, payload, recent.end)
         if payload[:4] != MAGIC:
             raise Rejected("format", "the payload does not begin with NCS1")
         length = int.from_bytes(payload[4:8], "little")
@@ -171,33 +260,73 @@ class Decoder(Generic[M]):
         form = self._forms.get(key)
         if match is not None and form is not None:
             seq, step, lane = match.group(1, 2, 3)
-            variant = _variant(form.header, int(seq), int(step), int(lane))
-            self._check_range(variant)
-            return variant, self._arrays(form.layout, payload, 8 + length)
+            header = _variant(form.header, int(seq), int(step), int(lane))
+            self._check_range(header)
+            arrays = self._arrays(form.layout, payload, 8 + length)
+        else:
+            header = self._valid(payload[8 : 8 + length])
+            if not isinstance(header, Packet):
+                if len(payload) != 8 + length:
+                    raise Rejected("format", f"{len(payload) - 8 - length} bytes behind a header without arrays")
+                return header, {}
+            self._check_range(header)
+            form = _Form(header, self._layout(header.arrays, header.lanes))
+            if match is not None and len(self._forms) < _FORMS_MAX:
+                self._forms[key] = form
+            arrays = self._arrays(form.layout, payload, 8 + length)
+        if match is not None:
+            tail_at = match.end(2)
+            tail = payload[tail_at : 8 + length]
+            recent = _Recent(_Form(header, form.layout), payload[:numbers_at], tail, tail_at, 8 + length)
+            if len(self._recent) >= _FORMS_MAX:
+                self._recent.clear()
+            self._recent[len(payload)] = recent
+        return header, arrays
+
+    def _valid(self, text: bytes) -> M:
+        """A header as its model wants it."""
         try:
-            header = cast(M, self._validate(payload[8 : 8 + length]))
+            header = cast(M, self._validate(text))
         except ValidationError as error:
             raise Rejected("schema", _first_error(error)) from None
         if not header.model_fields_set >= header.ALWAYS:
             raise Rejected("schema", f"{', '.join(sorted(header.ALWAYS - header.model_fields_set))}: Field required")
         if header.run != self._run:
             raise Rejected("run", f"of run {header.run}, this is {self._run}")
-        if not isinstance(header, Packet):
-            if len(payload) != 8 + length:
-                raise Rejected("format", f"{len(payload) - 8 - length} bytes behind a header without arrays")
-            return header, {}
-        self._check_range(header)
-        layout = self._layout(header.arrays, header.lanes)
-        if match is not None and len(self._forms) < _FORMS_MAX:
-            self._forms[key] = _Form(header, layout)
-        return header, self._arrays(layout, payload, 8 + length)
+        return header
+
+    def _alike(self, messages: list[bytes]) -> list[tuple[M, Content]] | None:
+        """All messages of one length at once, where they differ in seq, step and values only and all are valid."""
+        if isinstance(self._outcome(messages[0]), Rejected):
+            return None
+        size, recent = len(messages[0]), self._recent.get(len(messages[0]))
+        if recent is None or not recent.form.layout.slots or size != recent.end + recent.form.layout.size:
+            return None
+        like, layout = recent.form.header, recent.form.layout
+        numbers = recent.numbers_of(messages)
+        first, last = like.FIRST_STEP, like.FIRST_STEP + self._sizes.steps - 1
+        if not all(pair is not None and first <= pair[1] <= last for pair in numbers):
+            return None
+        whole = b"".join(messages)
+        columns = []
+        for slot in layout.slots:
+            shape, strides = (len(messages), slot.count), (size, slot.dtype.itemsize)
+            column = np.ndarray(shape, slot.dtype, whole, recent.end + slot.offset, strides)
+            valid = np.isfinite(column).all() if slot.dtype is _FLOAT else not (column > 1).any()
+            if not valid or (layout.bare_mask and column.any()):
+                return None
+            columns.append(column.reshape(len(messages), *slot.shape))
+        names = [slot.name for slot in layout.slots]
+        rows = zip(*columns, strict=True)
+        headers = [_variant(like, *pair, like.lane) for pair in numbers if pair is not None]
+        return [(header, dict(zip(names, row, strict=True))) for header, row in zip(headers, rows, strict=True)]
 
     def _check_range(self, header: Packet) -> None:
         past = header.step - header.FIRST_STEP
         if not 0 <= past < self._sizes.steps or header.lane + header.lanes > self._sizes.lanes:
             raise Rejected("range", f"step {header.step}, lanes {header.lane}…{header.lane + header.lanes - 1}")
 
-    def _arrays(self, layout: _Layout, payload: bytes, offset: int) -> dict[str, NDArray[Any]]:
+    def _arrays(self, layout: _Layout, payload: bytes, offset: int) -> Content:
         if len(payload) != offset + layout.size:
             raise Rejected("format", f"payload of {len(payload)} bytes, its arrays need {offset + layout.size}")
         out = {}
@@ -236,13 +365,14 @@ class Decoder(Generic[M]):
 
 
 def all_finite(x: NDArray[np.float64]) -> bool:
-    """Whether every entry of a flat array is finite, reading each once in the common case.
+    """Whether every entry of an array is finite, reading each once in the common case.
 
     The product of the two halves is finite only if every factor is; if it is not, it may be an overflow: look closely.
     vdot, unlike dot, does not warn of that.
     """
+    x = x.reshape(-1)
     if len(x) <= _FEW:
-        return all(map(math.isfinite, x.tolist()))
+        return math.isfinite(sum(x.tolist())) or bool(np.isfinite(x).all())
     half = len(x) // 2
     if len(x) > 1 and math.isfinite(np.vdot(x[:half], x[half : 2 * half])):
         return len(x) % 2 == 0 or math.isfinite(x[-1])

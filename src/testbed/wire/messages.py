@@ -143,7 +143,7 @@ class BoundsMessage(Packet):
         "trace_lower": _floats("lanes", text="tr Pᴬ_k"),
         "trace_upper": _floats("lanes", text="tr S_k; absent for an input without a bound", required=False),
         "trace_upper_correlated": _floats(
-            "lanes", text="tr S_k with room for correlated control losses; only under Markov ones", required=False
+            "lanes", text="tr S_k with room for correlated control losses; only under such", required=False
         ),
     }
 

@@ -84,26 +84,30 @@ class Node:
         """
         sizes = self.sizes if last is None else replace(self.sizes, steps=last)
         decoder, turns = Decoder(model, self.run, sizes), _Turns(None if cut else sizes.lanes_per_packet, sizes.lanes)
-        expected, required = 0, set(needs)
+        expected = 0
 
         def receive(_: str, payload: bytes) -> None:
             nonlocal expected
-            try:
-                header, arrays = decoder.decode(payload)
-                if header.source != source:
-                    raise Rejected("source", f"from {header.source}, expected {source}")
-                if header.seq != expected:
-                    raise Rejected("sequence", f"number {header.seq}, expected {expected}")
-                if needs and not arrays.keys() >= required:
-                    raise Rejected("arrays", f"lacks one of {', '.join(needs)}")
-                if isinstance(header, Packet):
-                    turns.check(header)
-            except Rejected as refusal:
-                self.rejected[refusal.reason] += 1
-                return
-            expected += 1
-            self.payload = payload
-            handler(header, arrays)
+            for message, outcome in decoder.read(payload):
+                try:
+                    if isinstance(outcome, Rejected):
+                        raise outcome
+                    header, arrays = outcome
+                    if header.source != source:
+                        raise Rejected("source", f"from {header.source}, expected {source}")
+                    if header.seq != expected:
+                        raise Rejected("sequence", f"number {header.seq}, expected {expected}")
+                    for name in needs:
+                        if name not in arrays:
+                            raise Rejected("arrays", f"lacks {name}")
+                    if isinstance(header, Packet):
+                        turns.check(header)
+                except Rejected as refusal:
+                    self.rejected[refusal.reason] += 1
+                    continue
+                expected += 1
+                self.payload = message
+                handler(header, arrays)
 
         self.bus.subscribe(key, receive)
 
@@ -141,9 +145,11 @@ class _Turns:
         lane, size = packet.lane, self._per_packet
         if size is not None and (lane % size or packet.lanes != min(size, self._lanes - lane)):
             raise Rejected("range", f"lanes {lane}…{lane + packet.lanes - 1} are not a packet of this run")
-        due = self._due.get(lane, packet.FIRST_STEP)
-        if packet.step != due:
-            raise Rejected("order", f"step {packet.step}, expected {due}")
+        step, due = packet.step, self._due.get(lane)
+        if due is None:
+            due = packet.FIRST_STEP
+        if step != due:
+            raise Rejected("order", f"step {step}, expected {due}")
         self._due[lane] = due + 1
 
 

@@ -62,6 +62,7 @@ def _serve(bus: ZenohBus, run: str, name: str, build: Build) -> int:
         return _refuse(str(error))
     bus.express = setup.window == 1
     node = Node(bus, run, name, setup.sizes, setup.tap)
+    bus.direct = setup.direct
     role: Role | None = None
     try:
         role = build(node, setup)

@@ -14,6 +14,8 @@ from testbed.wire.node import Node
 
 _WINDOW_MAX = 256
 _BYTES_IN_FLIGHT = 4_000_000
+_CLOSED_LOOP_CREDIT = 64  # steps
+_DIRECT_MAX = 8_192  # bytes
 _SHARED_MIN = 65_536  # bytes of the largest packet from which shared memory pays
 
 
@@ -52,14 +54,31 @@ class Setup:
         return max(4, min(_WINDOW_MAX, _BYTES_IN_FLIGHT // bytes_a_step))
 
     @property
+    def credit(self) -> int:
+        """Steps that the clock grants ahead: in a closed loop the estimate holds back the next step, not the clock."""
+        return _CLOSED_LOOP_CREDIT if self.closed_loop else self.window
+
+    @property
+    def direct(self) -> bool:
+        """Whether roles handle packets on the thread that receives them: with one small packet in flight.
+
+        A thread hand-over less; but a role that sends does not receive meanwhile.
+        """
+        return self.window == 1 and len(self.blocks) == 1 and self._largest <= _DIRECT_MAX
+
+    @property
+    def _largest(self) -> int:
+        """Bytes of the largest packet, an estimate."""
+        return 8 * self.blocks[0][1] * self.sizes.n * (1 + self.sizes.n)
+
+    @property
     def transport(self) -> Transport:
         """The scenario's transport, with what it leaves to the run decided."""
         transport = self.scenario.transport
         if transport.shared_memory is not None:
             return transport
-        largest = 8 * self.blocks[0][1] * self.sizes.n * (1 + self.sizes.n)
         local = transport.endpoint is None or "127.0.0.1" in transport.endpoint
-        return transport.model_copy(update={"shared_memory": local and largest >= _SHARED_MIN})
+        return transport.model_copy(update={"shared_memory": local and self._largest >= _SHARED_MIN})
 
     @property
     def tap(self) -> int:

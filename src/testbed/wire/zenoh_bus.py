@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import queue
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import zenoh
 
-from testbed.wire.bundle import bundle, unbundle
+from testbed.wire.bundle import bundle
 from testbed.wire.bus import Answer, BusError, Handler, PresenceHandler, Publish
 
 INBOX_MAX = 65536
@@ -40,11 +43,16 @@ class ZenohBus:
     Small messages that come out of events handled in one go leave in one payload for each key, so that order is kept
     on each key but not between keys.
 
-    express: send each message at once instead of batching; right when only one is in flight.
+    express: send each message at once instead of batching; right when only one is in flight. direct: handle messages
+    on the thread that receives them, while ``run`` waits for everything else; right for small messages of which one is
+    in flight, in a client, whose messages all come over one link. Both count for what is declared afterwards.
     """
 
     def __init__(self, session: zenoh.Session, *, deadline_s: float = 10.0, express: bool = False) -> None:
         self._session, self._deadline_s, self.express = session, deadline_s, express
+        self.direct = False
+        self._lock = threading.Lock()
+        self._failed = False
         self._inbox: queue.SimpleQueue[tuple[Callable[..., None], Any]] = queue.SimpleQueue()
         self._declared: list[Any] = []
         self._outbox: list[_Outgoing] = []
@@ -57,20 +65,22 @@ class ZenohBus:
         except queue.Empty:
             self.flush()
             return False
-        self._handling = True
-        try:
-            handle(event)
-            for _ in range(min(self._inbox.qsize(), _AT_ONCE)):
-                handle, event = self._inbox.get_nowait()
+        with self._lock:
+            self._handling = True
+            try:
                 handle(event)
-        finally:
-            self._handling = False
-            self._send(lazy=False)
+                for _ in range(min(self._inbox.qsize(), _AT_ONCE)):
+                    handle, event = self._inbox.get_nowait()
+                    handle(event)
+            finally:
+                self._handling = False
+                self._send(lazy=False)
         return True
 
     def flush(self) -> None:
         """Send everything that is held back."""
-        self._send(lazy=True)
+        with self._lock:
+            self._send(lazy=True)
 
     def publisher(self, key: str, *, lazy: bool = False) -> Publish:
         publisher = self._session.declare_publisher(
@@ -85,7 +95,7 @@ class ZenohBus:
         self._outbox.append(_Outgoing(put, waiting, lazy))
 
         def publish(payload: bytes) -> None:
-            if not self._handling:
+            if not self._handling and not (lazy and self.direct):
                 put(payload)
                 return
             waiting.append(payload)
@@ -97,11 +107,10 @@ class ZenohBus:
 
     def subscribe(self, key: str, handler: Handler) -> None:
         def handle(sample: Any) -> None:
-            name = str(sample.key_expr) if "*" in key else key
-            for message in unbundle(sample.payload.to_bytes()):
-                handler(name, message)
+            handler(str(sample.key_expr) if "*" in key else key, sample.payload.to_bytes())
 
-        self._declared.append(self._session.declare_subscriber(key, self._into_inbox(handle)))
+        receive = self._at_once(handle) if self.direct else self._into_inbox(handle)
+        self._declared.append(self._session.declare_subscriber(key, receive))
 
     def ask(self, key: str, question: bytes = b"") -> bytes:
         replies = self._session.get(key, payload=question, timeout=self._deadline_s)
@@ -143,8 +152,28 @@ class ZenohBus:
                 outgoing.since = now
 
     def _patience_s(self, timeout_s: float) -> float:
-        held_back = any(outgoing.waiting for outgoing in self._outbox)
+        held_back = self.direct or any(outgoing.waiting for outgoing in self._outbox)
         return min(timeout_s, _IDLE_S) if held_back else timeout_s
+
+    def _at_once(self, handle: Callable[..., None]) -> Any:
+        inbox, lock = self._inbox, self._lock
+        known: set[int] = set()
+
+        def take(event: Any) -> None:
+            if threading.get_ident() not in known:
+                known.add(threading.get_ident())
+                _keep_thread_state()
+            with lock:
+                if self._failed:
+                    return
+                try:
+                    with np.errstate(all="ignore"):  # as in the thread that calls run
+                        handle(event)
+                except Exception as error:
+                    self._failed = True
+                    inbox.put((_raise, error))
+
+        return zenoh.handlers.Callback(take, indirect=False)
 
     def _into_inbox(self, handle: Callable[..., None]) -> Any:
         inbox = self._inbox
@@ -155,3 +184,12 @@ class ZenohBus:
             inbox.put((handle, event))
 
         return zenoh.handlers.Callback(put, indirect=False)
+
+
+def _keep_thread_state() -> None:
+    """Of a thread that is not Python's: it would be made and freed in every call, and with it memory be mapped."""
+    ctypes.pythonapi.PyGILState_Ensure()
+
+
+def _raise(error: Exception) -> None:
+    raise error

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise, product
 
 import numpy as np
 from hypothesis import settings
@@ -16,6 +18,8 @@ Ints = NDArray[np.int64]
 ACKS = ("none", "all", "subset", "late")
 ARRIVALS = ("all", "none", "random")
 CHAINS = ("bernoulli", "markov")
+HIDDEN = "gilbert-elliott"
+"""The kind of losses that not every estimator holds."""
 
 
 def check(examples: int) -> settings:
@@ -24,8 +28,34 @@ def check(examples: int) -> settings:
 
 
 @dataclass(frozen=True)
+class Channel:
+    """A Gilbert–Elliott channel: P(good→bad), P(bad→good), P(loss) in each state, P(first state good)."""
+
+    to_bad: float
+    to_good: float
+    loss_good: float
+    loss_bad: float
+    start_good: float
+
+    def start(self, good: int) -> float:
+        return self.start_good if good else 1.0 - self.start_good
+
+    def move(self, good: int, to: int) -> float:
+        to_good = 1.0 - self.to_bad if good else self.to_good
+        return to_good if to else 1.0 - to_good
+
+    def fate(self, good: int, nu: int) -> float:
+        """P(ν | state)."""
+        lost = self.loss_good if good else self.loss_bad
+        return 1.0 - lost if nu else lost
+
+
+@dataclass(frozen=True)
 class System:
-    """x⁺ = A x + ν B u + w, y = C x + v; ν a chain with P(0→1) = recovery, P(1→0) = failure, P(ν_0 = 1) = start."""
+    """x⁺ = A x + ν B u + w, y = C x + v; ν a chain with P(0→1) = recovery, P(1→0) = failure, P(ν_0 = 1) = start.
+
+    With a ``channel``, ν is that of it instead.
+    """
 
     A: Floats
     B: Floats
@@ -37,6 +67,7 @@ class System:
     recovery: float
     failure: float
     start: float
+    channel: Channel | None = None
 
     @property
     def n(self) -> int:
@@ -52,9 +83,20 @@ class System:
 
     def arrival(self, last: int | None) -> float:
         """P(ν_k = 1 | ν_{k-1} = last); last None: the first packet."""
+        assert self.channel is None
         if last is None:
             return self.start
         return 1.0 - self.failure if last else self.recovery
+
+    def prior(self, history: tuple[int, ...]) -> float:
+        """P(ν_0 … ν_{k−1} = history); with a channel the sum over all paths of its state."""
+        if self.channel is not None:
+            return _over_paths(self.channel, history)
+        prior = 1.0
+        for j, nu in enumerate(history):
+            arrival = self.arrival(history[j - 1] if j else None)
+            prior *= arrival if nu else 1.0 - arrival
+        return prior
 
     def moved(self, T: Floats) -> System:
         """The same system in the coordinates T x."""
@@ -68,6 +110,19 @@ class System:
             x0_mean=T @ self.x0_mean,
             P0=_symmetric(T @ self.P0 @ T.T),
         )
+
+
+@lru_cache(maxsize=4096)
+def _over_paths(channel: Channel, history: tuple[int, ...]) -> float:
+    total = 0.0
+    for path in product((0, 1), repeat=len(history)):
+        chance = channel.start(path[0]) if path else 1.0
+        for good, to in pairwise(path):
+            chance *= channel.move(good, to)
+        for good, nu in zip(path, history, strict=True):
+            chance *= channel.fate(good, nu)
+        total += chance
+    return total
 
 
 @dataclass(frozen=True)
@@ -133,6 +188,7 @@ def random_system(
         recovery, failure, start = rate, 1.0 - rate, rate
     else:
         recovery, failure, start = (float(rng.uniform(0.05, 0.95)) for _ in range(3))
+    channel = random_channel(rng) if chain == HIDDEN else None
     return System(
         A=A,
         B=rng.normal(size=(n, q)) * rng.uniform(0.3, 3.0),
@@ -144,16 +200,40 @@ def random_system(
         recovery=recovery,
         failure=failure,
         start=start,
+        channel=channel,
+    )
+
+
+def random_channel(rng: np.random.Generator) -> Channel:
+    """In one of three a state that loses nothing, or everything."""
+    kind = int(rng.integers(3))
+    return Channel(
+        to_bad=float(rng.uniform(0.05, 0.95)),
+        to_good=float(rng.uniform(0.05, 0.95)),
+        loss_good=0.0 if kind == 1 else float(rng.uniform(0.02, 0.4)),
+        loss_bad=1.0 if kind == 2 else float(rng.uniform(0.5, 0.95)),
+        start_good=float(rng.uniform(0.05, 0.95)),
     )
 
 
 def _losses(rng: np.random.Generator, system: System, steps: int, lanes: int) -> Ints:
     nu = np.zeros((steps, lanes), dtype=np.int64)
     for lane in range(lanes):
+        if system.channel is not None:
+            nu[:, lane] = _channel_losses(rng, system.channel, steps)
+            continue
         last: int | None = None
         for j in range(steps):
             last = int(rng.random() < system.arrival(last))
             nu[j, lane] = last
+    return nu
+
+
+def _channel_losses(rng: np.random.Generator, channel: Channel, steps: int) -> list[int]:
+    good, nu = int(rng.random() < channel.start_good), []
+    for _ in range(steps):
+        nu.append(int(rng.random() < channel.fate(good, 1)))
+        good = int(rng.random() < channel.move(good, 1))
     return nu
 
 

@@ -8,10 +8,18 @@ from typing import Any
 import numpy as np
 
 from estimator.reference.cases import Floats, System, Trial
+from testbed.channel.gilbert_elliott import GilbertElliott
 from testbed.channel.loss import Chain
 from testbed.estimator.bounds import Bounds
 from testbed.estimator.model import Ack, Model
 from testbed.estimator.registry import create
+
+
+def losses_of(system: System) -> Chain | GilbertElliott:
+    c = system.channel
+    if c is None:
+        return Chain(system.recovery, system.failure, system.start)
+    return GilbertElliott.of(c.to_bad, c.to_good, c.loss_good, c.loss_bad, c.start_good)
 
 
 def model_of(system: System) -> Model:
@@ -23,7 +31,7 @@ def model_of(system: System) -> Model:
         R=system.R,
         x0_mean=system.x0_mean,
         P0=system.P0,
-        control=Chain(system.recovery, system.failure, system.start),
+        control=losses_of(system),
     )
 
 

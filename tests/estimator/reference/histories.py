@@ -16,10 +16,7 @@ def weighted_histories(system: System, k: int, known: dict[int, int]) -> tuple[F
     for history in product((0, 1), repeat=k):
         if any(history[j] != nu for j, nu in known.items()):
             continue
-        prior = 1.0
-        for j, nu in enumerate(history):
-            arrival = system.arrival(history[j - 1] if j else None)
-            prior *= arrival if nu else 1.0 - arrival
+        prior = system.prior(history)
         if prior > 0:
             kept.append(history)
             priors.append(prior)

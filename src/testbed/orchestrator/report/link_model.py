@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 from pydantic import TypeAdapter, ValidationError
 
+from testbed.analysis.bursts import run_law
 from testbed.channel.chains import chain_of
-from testbed.channel.loss import Chain
+from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.law import LossModel
 from testbed.orchestrator.summary import LinkFigures, Summary
 from testbed.scenario import Loss
 
@@ -45,27 +47,37 @@ def expected_links(summary: Summary, scenario_toml: str) -> dict[str, Expected]:
     return expected
 
 
-def _expected(chain: Chain, figures: LinkFigures, lanes: int) -> Expected:
-    """Lanes are independent; within a lane neighbours have correlation ρ = 1 − recovery − failure.
+def _expected(losses: LossModel, figures: LinkFigures, lanes: int) -> Expected:
+    """Lanes are independent; within a lane packets j apart have correlation coupling · memory^j.
 
-    The spread is that of a stationary chain. Bursts are geometric with parameter `recovery`; those that the end of the
-    run cuts short are not allowed for.
+    The spread is that of the stationary law. Bursts of a chain of arrivals are geometric with parameter `recovery`;
+    those that the end of the run cuts short are not allowed for.
     """
-    arrival, spread = _arrivals(chain, steps=max(1, round(figures.sent / lanes)))
-    recovery, bursts = chain.recovery, figures.transitions.delivered_lost
+    arrival, spread = _arrivals(losses, steps=max(1, round(figures.sent / lanes)))
     return Expected(
         loss_rate=1.0 - arrival,
         loss_rate_deviation=spread / math.sqrt(lanes),
-        mean_burst=None if chain.never_loses else chain.mean_burst,
-        mean_burst_deviation=math.sqrt((1.0 - recovery) / bursts) / recovery if recovery and bursts else None,
+        mean_burst=None if losses.never_loses else losses.mean_burst,
+        mean_burst_deviation=_burst_spread(losses, figures.transitions.delivered_lost),
     )
 
 
-def _arrivals(chain: Chain, steps: int) -> tuple[float, float]:
+def _burst_spread(losses: LossModel, bursts: int) -> float | None:
+    """Standard deviation of the mean length of that many bursts."""
+    if isinstance(losses, GilbertElliott):
+        law = run_law(losses, False)
+        return math.sqrt(law.variance_of_mean / bursts) if law is not None and bursts else None
+    recovery = losses.recovery
+    return math.sqrt((1.0 - recovery) / bursts) / recovery if recovery and bursts else None
+
+
+def _arrivals(losses: LossModel, steps: int) -> tuple[float, float]:
     """Mean share of arrivals in one lane over `steps` steps, and its standard deviation."""
-    leaving = chain.recovery + chain.failure
+    states = losses.states if isinstance(losses, GilbertElliott) else losses
+    leaving = states.recovery + states.failure
     rho = 1.0 - leaving
     geometric = (1.0 - rho**steps) / leaving  # Σ ρ^j, j = 0 … steps − 1
     correlated = rho * (steps - geometric) / leaving  # Σ (steps − j) ρ^j, j = 1 … steps − 1
-    variance = chain.arrival * (1.0 - chain.arrival) * (steps + 2.0 * correlated) / steps**2
-    return chain.arrival + (chain.start - chain.arrival) * geometric / steps, math.sqrt(max(0.0, variance))
+    variance = losses.arrival * (1.0 - losses.arrival) * (steps + 2.0 * losses.coupling * correlated) / steps**2
+    mean = losses.arrival + (losses.first_arrival - losses.arrival) * geometric / steps
+    return mean, math.sqrt(max(0.0, variance))
