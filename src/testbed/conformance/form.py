@@ -30,7 +30,8 @@ def shapes(subject: Subject) -> str:
         isinstance(k, str) and isinstance(v, int) for k, v in counters.items()
     ):
         raise Failed(f"counters is {counters!r}; expected whole numbers by name")
-    return f"n = 1, 2, 3 on 1 and 3 lanes, {_steps(subject.runs)} steps"
+    systems = "; ".join(f"{case.name}, lanes {case.lanes}" for case in subject.cases)
+    return f"{_steps(subject.runs)} steps: {systems}"
 
 
 def finite(subject: Subject) -> str:

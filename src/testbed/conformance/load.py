@@ -12,25 +12,26 @@ from typing import Any
 
 from testbed.conformance.subject import Subject
 from testbed.errors import UsageError, did_you_mean
-from testbed.estimator.registry import create, kinds
+from testbed.estimator.registry import checked_options, factory_of, kinds
 
 
 def subject_of(name: str, options: Mapping[str, Any]) -> Subject:
     """MODULE:OBJECT, the module also from the working folder, or the kind of a registered estimator.
 
-    Raises UsageError where there is no such module, object or kind, or where it cannot be imported.
+    Raises UsageError where there is no such module, object or kind, where it cannot be imported,
+    and for a wrong option.
     """
     if ":" in name:
         module, _, path = name.partition(":")
-        return Subject(name, _object(name, module, path), options)
-    if name not in kinds():
+        if not module or module.startswith("."):
+            raise UsageError(f"{name}: allowed: MODULE:OBJECT")
+        factory = _object(name, module, path)
+    elif name in kinds():
+        factory = factory_of(name)
+    else:
         listed = ", ".join(kinds())
         raise UsageError(f"{name}: no such estimator; allowed: MODULE:OBJECT, or {listed}{did_you_mean(name, kinds())}")
-
-    def registered(model: Any, lanes: int, **given: Any) -> Any:
-        return create(name, model, lanes=lanes, options=given)
-
-    return Subject(name, registered, options)
+    return Subject(name, factory, checked_options(name, factory, dict(options)))
 
 
 def _object(name: str, module: str, path: str) -> Callable[..., Any]:

@@ -111,6 +111,7 @@ class Subject:
                     raise
         return refused
 
+    @cached_property
     def small(self) -> dict[str, Model]:
         """The systems with one and two states, of those that it takes. Raises Skipped where it takes none of them."""
         models = {"n = 1": one(self.control), "n = 2": two(self.control)}

@@ -109,7 +109,7 @@ def consistency(subject: Subject) -> str:
 
 def long_losses(subject: Subject) -> str:
     """hundreds of lost observations: finite, P not below the covariance with every ACK, and back afterwards"""
-    systems = subject.small()
+    systems = subject.small
     worst = min(_through(subject, LOST, name, model, IN_TIME) for name, model in systems.items())
     texts = [f"{LOST} lost in a row with every ACK"]
     if not subject.delays:
@@ -144,7 +144,7 @@ def _through(subject: Subject, lost: int, name: str, model: Model, delays: tuple
 
 
 def _many(subject: Subject) -> list[Case]:
-    models = subject.small().items()
+    models = subject.small.items()
     return [simulated(name, model, steps=8, lanes=_LANES, seed=11 + model.n) for name, model in models]
 
 
