@@ -70,7 +70,7 @@ def examine(subject: Subject) -> Report:
     first = examine_by(CHECKS[0], subject)
     try:
         subject.make(subject.cases[0])
-    except Exception:  # whatever a stranger's code raises; the first check has failed with it
+    except (Exception, SystemExit):  # whatever a stranger's code raises; the first check has failed with it
         rest = [Result(c.__name__, inspect.getdoc(c) or "", "skipped", "it cannot be made") for c in CHECKS[1:]]
     else:
         rest = [examine_by(check, subject) for check in CHECKS[1:]]
@@ -89,7 +89,7 @@ def examine_by(check: Check, subject: Subject) -> Result:
         return Result(name, what, "skipped", _line(str(reason)))
     except Failed as failure:
         return Result(name, what, "failed", _line(str(failure)))
-    except Exception as error:  # whatever a stranger's code raises is its failure
+    except (Exception, SystemExit) as error:  # whatever a stranger's code raises is its failure
         return Result(name, what, "failed", _line(f"raised {type(error).__name__}: {error}"))
 
 
