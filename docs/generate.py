@@ -1,4 +1,4 @@
-"""Write the pages of the reference that follow from the code: scenario, messages, commands, summary.
+"""Write the pages of the reference that follow from the code: scenario, messages, commands, conformance, summary.
 
 python docs/generate.py            write them
 python docs/generate.py --check    exit code 1 if one is not up to date
@@ -18,6 +18,9 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 import typer
 
 from testbed.cli.main import app
+from testbed.conformance.form import ROUNDING
+from testbed.conformance.kit import CHECKS, CLAIMS
+from testbed.conformance.theory import EXACT, LOST, LOST_BLIND, NEES, SHORTFALL
 from testbed.estimator.registry import kinds
 from testbed.orchestrator.summary import summary_json_schema
 from testbed.scenario import scenario_json_schema
@@ -165,9 +168,34 @@ def messages_page() -> str:
 def commands_page() -> str:
     return _page(
         "Commands",
-        "Exit codes: 0 success, 1 a run that failed, 2 wrong input, 130 interrupted. Errors are one line on standard "
-        "error. `testbed --version` shows the version, `testbed COMMAND --help` the same as below.",
+        "Exit codes: 0 success, 1 a run or a check that failed, 2 wrong input, 130 interrupted. Errors are one line on "
+        "standard error. `testbed --version` shows the version, `testbed COMMAND --help` the same as below.",
         list(_commands(app, "testbed")),
+    )
+
+
+def conformance_page() -> str:
+    claims = {check.__name__ for check in CLAIMS}
+    rows = []
+    for check in CHECKS:
+        needs = "may be not claimed" if check.__name__ in claims else "must hold"
+        rows.append((f"`{check.__name__}`", _one_line(inspect.getdoc(check) or ""), needs))
+    return _page(
+        "Conformance",
+        "What `testbed conformance` checks. [Your own estimator in 40 lines](../how-to/own-estimator.md) shows how.",
+        [
+            _table(("check", "what it wants", "kind"), rows),
+            "The kit runs an estimator on systems with one, two and three states, unstable ones among them, with "
+            "observation losses in bursts. Control losses are Markov or, where the estimator refuses those, i.i.d.; "
+            "where it takes Markov ones, Gilbert–Elliott ones too. ACKs come in time, not at all, or late; an "
+            "estimator that raises `MissingAck` gets them in time. Systems that it refuses with `UsageError` are left "
+            "out, and `declaration` names them. `restart` and `hand_over` are skipped where it offers no snapshot, "
+            "`entry_point` where no package registers it. All seeds are fixed.",
+            f"Tolerances: symmetry, eigenvalues and lanes {ROUNDING:g}; `coordinates`, `kfio_with_acks` and "
+            f"`hand_over` {EXACT:g}, and what the estimator certifies of itself; `ack_bound` {1 - SHORTFALL:g} times "
+            "the bound; "
+            f"`consistency` {NEES[0]} … {NEES[1]} n; `long_losses` {LOST} losses, {LOST_BLIND} without ACKs.",
+        ],
     )
 
 
@@ -176,6 +204,7 @@ PAGE_MAKERS: dict[str, Callable[[], str]] = {
     "summary.md": summary_page,
     "messages.md": messages_page,
     "commands.md": commands_page,
+    "conformance.md": conformance_page,
 }
 
 

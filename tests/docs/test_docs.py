@@ -8,6 +8,7 @@ import shlex
 import shutil
 import signal
 import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,17 +27,24 @@ C = [[1.0]]
 Q = [[1.0]]
 R = [[1.0]]
 """
-RUNNABLE = [page for page in PAGES if any(b.directive.startswith(("run", "file", "part")) for b in blocks_of(page))]
+RUNNABLE = [
+    page for page in PAGES if any(b.directive.startswith(("run", "file", "copy", "part")) for b in blocks_of(page))
+]
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An empty folder with the scenarios, a terminal of 80 columns, and signal handlers as they were."""
+    """A folder with the scenarios, searched for modules, a terminal of 80 columns; signal handlers as they were."""
     shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.syspath_prepend(tmp_path)
+    modules = set(sys.modules)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield tmp_path
+    for name in set(sys.modules) - modules:
+        if str(getattr(sys.modules[name], "__file__", None)).startswith(str(tmp_path)):
+            del sys.modules[name]
     for number, handler in handlers.items():
         signal.signal(number, handler)
 
@@ -52,6 +60,8 @@ def test_blocks_run_as_shown(page: Path) -> None:
             Path(rest).write_text(block.text)
             if "[system]" in block.text:
                 parse_scenario(block.text, source=where)
+        elif verb == "copy:":
+            Path(Path(rest).name).write_text(block.text)
         elif verb == "part:":
             parse_scenario(SMALLEST + block.text, source=where)
         elif verb == "run" and block.language == "python":
@@ -71,7 +81,10 @@ def test_blocks_are_what_they_say(page: Path) -> None:
         if block.directive.startswith("same as: "):
             other = ROOT / block.directive.removeprefix("same as: ")
             assert block.text in other.read_text(encoding="utf-8"), f"{where} differs from {other.name}"
-        known = ("", "run", "file:", "part:", "output", "same")
+        if block.directive.startswith("copy: "):
+            other = ROOT / block.directive.removeprefix("copy: ")
+            assert block.text == other.read_text(encoding="utf-8"), f"{where} differs from {other.name}"
+        known = ("", "run", "file:", "copy:", "part:", "output", "same")
         assert block.directive.partition(" ")[0] in known, f"{where}: unknown {block.directive!r}"
 
 
@@ -93,8 +106,14 @@ def run_console(block: Block, last_code: int, where: str) -> None:
 
 
 def execute(command: str) -> tuple[int, str]:
-    """Exit code and output of a command; those of the testbed run in this process, runs on the in-process bus."""
+    """Exit code and output of a command; those of the testbed run in this process, runs on the in-process bus.
+
+    pip only notes the entry points of the package in the folder, as an editable installation does.
+    """
     words = shlex.split(command)
+    if command == "pip install --editable .":
+        install()
+        return 0, ""
     if words[0] != "testbed":
         done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=20, check=False)
         return done.returncode, done.stdout + done.stderr
@@ -105,3 +124,15 @@ def execute(command: str) -> tuple[int, str]:
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         code = run_command(arguments)
     return code, output.getvalue()
+
+
+def install() -> None:
+    """The metadata that pip makes of pyproject.toml."""
+    project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
+    info = Path(f"{project['name'].replace('-', '_')}-{project['version']}.dist-info")
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    lines = []
+    for group, points in project["entry-points"].items():
+        lines += [f"[{group}]", *(f"{name} = {value}" for name, value in points.items())]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")

@@ -82,3 +82,7 @@ def load(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def test_the_estimator_of_the_tutorial_is_short() -> None:
+    assert len((ROOT / "examples" / "own_estimator" / "fixed_gain.py").read_text().splitlines()) <= 40

@@ -46,6 +46,10 @@ class Pf:
     """
 
     STATE_VERSION: ClassVar[int] = 1
+    not_claimed: ClassVar[dict[str, str]] = {
+        "coordinates": "its draws depend on the coordinates",
+        "kfio_with_acks": "its mean and covariance are those of a sample",
+    }
 
     def __init__(
         self,

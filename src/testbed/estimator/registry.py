@@ -20,7 +20,7 @@ from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.model import Estimator, Model
 from testbed.scenario import EstimatorSpec, Scenario
 
-_BUILT_IN = {
+BUILT_IN = {
     "aoe": "testbed.estimator.aoe:Aoe",
     "ff": "testbed.estimator.ff:Ff",
     "gpb": "testbed.estimator.gpb:Gpb",
@@ -42,7 +42,7 @@ GROUP = "testbed.estimators"
 
 def kinds() -> list[str]:
     """All names that ``create`` knows."""
-    return sorted({*_BUILT_IN, *(point.name for point in entry_points(group=GROUP))})
+    return sorted({*BUILT_IN, *(point.name for point in entry_points(group=GROUP))})
 
 
 def create(
@@ -54,8 +54,8 @@ def create(
 
     Raises UsageError for an unknown kind or option, or where the estimator does not hold for the model.
     """
-    factory = _factory(kind)
-    made = factory(model, lanes, **_checked(kind, factory, dict(options or {})))
+    factory = factory_of(kind)
+    made = factory(model, lanes, **checked_options(kind, factory, dict(options or {})))
     begin_at = getattr(made, "begin_at", None)
     if begin_at is not None:
         begin_at(lane)
@@ -65,7 +65,7 @@ def create(
 def kind_of(estimator: Estimator) -> str:
     """The name of a built-in estimator, MODULE:CLASS of another."""
     path = f"{type(estimator).__module__}:{type(estimator).__qualname__}"
-    return next((kind for kind, known in _BUILT_IN.items() if known == path), path)
+    return next((kind for kind, known in BUILT_IN.items() if known == path), path)
 
 
 def check(spec: EstimatorSpec, model: Model, *, acks: str, scenario: Scenario) -> None:
@@ -106,9 +106,10 @@ def model_of(scenario: Scenario) -> Model:
     )
 
 
-def _factory(kind: str) -> Callable[..., Estimator]:
-    if kind in _BUILT_IN:
-        module, name = _BUILT_IN[kind].split(":")
+def factory_of(kind: str) -> Callable[..., Estimator]:
+    """What makes estimators of a kind. Raises UsageError for an unknown one."""
+    if kind in BUILT_IN:
+        module, name = BUILT_IN[kind].split(":")
         found: Callable[..., Estimator] = getattr(import_module(module), name)
         return found
     for point in entry_points(group=GROUP, name=kind):
@@ -117,8 +118,11 @@ def _factory(kind: str) -> Callable[..., Estimator]:
     raise UsageError(f"unknown estimator {kind!r}; allowed: {', '.join(kinds())}{did_you_mean(kind, kinds())}")
 
 
-def _checked(kind: str, factory: Callable[..., Estimator], options: dict[str, Any]) -> dict[str, Any]:
-    """Options as the factory's signature wants them: parameters after (model, lanes), by name and type."""
+def checked_options(kind: str, factory: Callable[..., Estimator], options: dict[str, Any]) -> dict[str, Any]:
+    """Options as the factory's signature wants them: parameters after (model, lanes), by name and type.
+
+    Raises UsageError for one that is unknown, missing or of another type.
+    """
     parameters = list(inspect.signature(factory).parameters.values())[2:]
     hints = get_type_hints(factory.__init__ if inspect.isclass(factory) else factory, include_extras=True)
     allowed = [parameter.name for parameter in parameters]

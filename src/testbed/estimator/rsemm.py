@@ -19,6 +19,10 @@ class Rsemm(Rse):
     """
 
     KIND: ClassVar[str] = "rsemm"
+    not_claimed: ClassVar[dict[str, str]] = {
+        "kfio_with_acks": "it takes y for γ̄C x + v, also where y arrived and is C x + v",
+        "consistency": "its P leaves out the bias that γ̄C in place of C brings",
+    }
 
     def __init__(self, model: Model, lanes: int, mu: Annotated[float, Gt(0), Le(1)] = 0.8) -> None:
         super().__init__(_faded(model), lanes, mu)
