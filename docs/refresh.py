@@ -58,6 +58,8 @@ def refresh(page: Path) -> bool:
         verb, _, rest = block.directive.partition(" ")
         if verb == "file:":
             Path(rest).write_text(block.text)
+        elif verb == "copy:":
+            Path(Path(rest).name).write_text(block.text)
         elif verb == "run" and block.language == "python":
             printed = run_python(block, namespace, page.name)
         elif verb == "output":
