@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Philox
 from numpy.typing import NDArray
 
 from testbed.numerics.circle import place
@@ -68,7 +69,7 @@ class Stream:
     def _raw_tile(self, number: int, words: int) -> NDArray[np.uint64]:
         """Random words of shape (TILE, words, lanes), 53 bits each."""
         counter = np.array([self._lane * TILE * words // 4, words, number, 0], dtype=np.uint64)
-        raw = np.random.Philox(key=self._key, counter=counter).random_raw(self._lanes * TILE * words)
+        raw = Philox(key=self._key, counter=counter).random_raw(self._lanes * TILE * words)
         tile = np.empty((TILE * words, self._lanes), dtype=np.uint64)
         np.right_shift(raw.reshape(self._lanes, TILE * words).T, np.uint64(11), out=tile)
         return tile.reshape(TILE, words, self._lanes)
@@ -99,7 +100,7 @@ class LaneStream:
 
     def _raw(self, lane: int, step: int, words: int) -> NDArray[np.uint64]:
         counter = np.array([0, lane, step, 1], dtype=np.uint64)
-        raw: NDArray[np.uint64] = np.random.Philox(key=self._key, counter=counter).random_raw(words)
+        raw: NDArray[np.uint64] = Philox(key=self._key, counter=counter).random_raw(words)
         raw >>= np.uint64(11)
         return raw
 

@@ -87,6 +87,7 @@ class Run:
             cleanup.callback(supervisor.close, 0.0)
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.window == 1)
             conductor = self._conductor(bus, recorder)
+            bus.subscribe(conductor.node.keys.warm("*"), lambda _key, _payload: None)
             threading.Thread(target=_import_report, daemon=True).start()
             for role in self._roles:
                 if role.name in external:

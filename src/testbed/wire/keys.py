@@ -54,6 +54,10 @@ class Keys:
     def status(self, role: str) -> str:
         return f"{self.prefix}/status/{role}"
 
+    def warm(self, role: str) -> str:
+        """Where a role publishes once, before it is present, what nobody reads: so that the transport is made ready."""
+        return f"{self.prefix}/warm/{role}"
+
     def presence(self, role: str) -> str:
         """Liveliness token of a role."""
         return f"{self.prefix}/presence/{role}"

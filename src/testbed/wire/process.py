@@ -24,6 +24,7 @@ from testbed.wire.setup import Build, Role, Setup
 from testbed.wire.zenoh_bus import ZenohBus
 
 _POLL_S = 1.0
+_WARM = 1 << 20  # bytes of a message that goes through shared memory, which is made at the first of them
 
 
 def parser(description: str) -> argparse.ArgumentParser:
@@ -67,6 +68,8 @@ def _serve(bus: ZenohBus, run: str, name: str, build: Build) -> int:
     try:
         role = build(node, setup)
         bus.watch(node.keys.presence(ORCHESTRATOR), lambda _, alive: None if alive else orphaned.set())
+        if setup.transport.shared_memory:
+            bus.publisher(node.keys.warm(name))(bytes(_WARM))
         settle_memory()
         node.announce()
         with np.errstate(all="ignore"):  # what is not finite is looked for where it would leave a role
