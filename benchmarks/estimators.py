@@ -153,7 +153,7 @@ def _optimal(figures: Figures, repetitions: int, *, quick: bool) -> None:
     }
     if visit is not None:
         references[f"all histories depth-first, {small} steps"] = visit
-    kind, rows = optimal.kind(), []
+    kind, rows = optimal.KIND, []
     runs = {(small, 1e-9): repetitions, (40, 1e-9): repetitions, (1000, 1e-6): 1 if quick else 3}
     for (steps, tolerance), times in runs.items():
         trial = given if steps == small else optimal.trial(model, steps)

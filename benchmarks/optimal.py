@@ -14,8 +14,7 @@ from testbed.errors import TestbedError
 from testbed.estimator.model import Model
 from testbed.estimator.registry import create
 
-KIND, FALLBACK = "oe", "oe-lattice"
-"""The kind with the option ``tolerance``, and that which has it where the first does not."""
+KIND = "oe"
 Floats = NDArray[np.float64]
 Result = tuple[Floats, Floats]
 
@@ -63,15 +62,6 @@ def trial(model: Model, steps: int, seed: int = 1) -> Result:
     return u, y
 
 
-def kind() -> str:
-    """Which kind takes a tolerance here."""
-    try:
-        create(KIND, system(), lanes=1, options={"tolerance": 1e-6})
-    except TestbedError:
-        return FALLBACK
-    return KIND
-
-
 def run(model: Model, given: Result, tolerance: float, limit_s: float) -> Outcome:
     """One lane, until done, refused or out of time."""
     u, y = given
@@ -79,7 +69,7 @@ def run(model: Model, given: Result, tolerance: float, limit_s: float) -> Outcom
     bound = bound_P = 0.0
     means, covariances = [], []
     try:
-        estimator = create(kind(), model, lanes=1, options={"tolerance": tolerance})
+        estimator = create(KIND, model, lanes=1, options={"tolerance": tolerance})
         begun = time.perf_counter()
         for k in range(len(u)):
             estimate = estimator.step(u[k : k + 1], y[k : k + 1], arrived)
