@@ -107,7 +107,7 @@ def _markov(fates: Bools, lost: int) -> Fitted:
 def _gilbert_elliott(fates: Bools) -> Fitted:
     found = fit_gilbert_elliott(fates)
     values = [float(value) for value in parameters(found.losses)]
-    why = "at the boundary" if found.identifiable else "not identifiable: the information is singular"
+    why = found.obstacle or "at the boundary, held there for the others"
     given = tuple(
         Parameter(name, value, interval, why if interval is None else "")
         for name, value, interval in zip(NAMES, values, found.intervals, strict=True)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.special import expit, logit
+from scipy.special import chdtri, expit, logit
 
-from testbed.analysis.fit_chains import fit_markov, stationary_rates
+from testbed.analysis.fit_chains import chain_log_likelihood, fit_bernoulli, fit_markov, stationary_rates
 from testbed.analysis.fit_intervals import Interval, around
 from testbed.analysis.fit_states import Expected, Fates
 from testbed.channel.gilbert_elliott import GilbertElliott
@@ -24,22 +24,25 @@ EM_STEPS = 15
 _BEST = 2  # starting points that are followed to the end
 _LOGIT_MAX = 14.0
 _SAME = 1e-6  # of the log-likelihood: what a parameter at 0 or 1 may cost
+_INDEPENDENT = float(chdtri(3, 0.05))  # gain in 2 log of the likelihood by three parameters that says nothing
+_NONE = (None,) * len(NAMES)
 _STEP = 1e-4  # in the logits
 _SINGULAR = 1e-4  # least eigenvalue of the information, scaled to ones on its diagonal
 
 
 @dataclass(frozen=True)
 class Found:
-    """The channel of largest likelihood. ``intervals`` of NAMES and of the stationary loss; None at 0 and 1.
+    """The channel of largest likelihood. ``intervals`` of NAMES and of the stationary loss.
 
-    identifiable: False where the information is singular; then there are no intervals at all.
+    Those of parameters at 0 and 1 are None, and the others are for these held there. Where the parameters cannot be
+    told from the fates, ``obstacle`` says why, and there are no intervals at all.
     """
 
     losses: GilbertElliott
     log_likelihood: float
     intervals: tuple[Interval | None, ...]
     loss_interval: Interval | None
-    identifiable: bool
+    obstacle: str = ""
 
 
 def fit_gilbert_elliott(fates: Bools) -> Found:
@@ -54,6 +57,9 @@ def fit_gilbert_elliott(fates: Bools) -> Found:
     simple = GilbertElliott(chain, 0.0, 1.0)
     ends = [simple, *(_climbed(seen, losses) for _, losses in begun[:_BEST])]
     losses = _at_the_boundary(seen, _ordered(max(ends, key=seen.log_likelihood)))
+    reached = seen.log_likelihood(losses)
+    if 2.0 * (reached - chain_log_likelihood(fates, fit_bernoulli(fates))) < _INDEPENDENT:
+        return Found(losses, reached, _NONE, None, "not identifiable: hardly likelier than independent losses")
     return _with_intervals(seen, losses)
 
 
@@ -165,17 +171,17 @@ def _with_intervals(seen: Fates, losses: GilbertElliott) -> Found:
     reached, values = seen.log_likelihood(losses), parameters(losses)
     free = np.flatnonzero((values > 0.0) & (values < 1.0))
     if not free.size:
-        return Found(losses, reached, (None,) * 4, None, identifiable=True)
+        return Found(losses, reached, _NONE, None)
     curvature = _differences(lambda at: score(at, seen.expected(at))[free], values, free)
     covariance = _inverse(-0.5 * (curvature + curvature.T))
     if covariance is None:
-        return Found(losses, reached, (None,) * 4, None, identifiable=False)
+        return Found(losses, reached, _NONE, None, "not identifiable: the information is singular")
     intervals: list[Interval | None] = [None] * 4
     for index, variance in zip(free, np.diag(covariance), strict=True):
         intervals[index] = around(float(values[index]), float(np.sqrt(variance)))
     slope = _differences(lambda at: np.array([logit(1.0 - at.arrival)]), values, free)[:, 0]
     loss = around(1.0 - losses.arrival, float(np.sqrt(slope @ covariance @ slope)))
-    return Found(losses, reached, tuple(intervals), loss, identifiable=True)
+    return Found(losses, reached, tuple(intervals), loss)
 
 
 def _differences(function: Callable[[GilbertElliott], Floats], values: Floats, free: NDArray[np.intp]) -> Floats:

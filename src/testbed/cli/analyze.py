@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from testbed.cli.tables import number as _number
 from testbed.cli.tables import row as _row
 from testbed.cli.tables import table as _table
 
@@ -154,6 +153,10 @@ def _law(end: float, quantile: int | None) -> str:
         return "of length 1" if end else "never end"
     text = f"{_number(end)} · {_number(1.0 - end)}^(l−1), mean {_number(1.0 / end)}"
     return text if quantile is None else f"{text}, 99 % at most {quantile}"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.6g}"
 
 
 def _eigenvalues(pairs: list[list[float | None]]) -> str:

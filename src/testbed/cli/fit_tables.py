@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from testbed.cli.tables import number, row, table
+from testbed.cli.tables import row, table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -53,7 +53,7 @@ def _parameters(fit: Fit) -> Table:
         if "loss" not in {parameter.name for parameter in parameters}:
             parameters.append(model.loss)
         for index, parameter in enumerate(parameters):
-            row(made, "" if index else model.kind, parameter.name, number(parameter.value), _interval(parameter))
+            row(made, "" if index else model.kind, parameter.name, f"{parameter.value:.4g}", _interval(parameter))
     return made
 
 
@@ -77,7 +77,7 @@ def _ratios(fit: Fit) -> Table:
 def _interval(parameter: Parameter) -> str:
     if parameter.interval is None:
         return f"–; {parameter.note}"
-    return f"{number(parameter.interval.low)} … {number(parameter.interval.high)}"
+    return f"{parameter.interval.low:.4g} … {parameter.interval.high:.4g}"
 
 
 def _p(value: float | None) -> str:

@@ -23,8 +23,3 @@ def row(to: Table, *cells: str) -> None:
     from rich.text import Text
 
     to.add_row(*(Text(cell) for cell in cells))
-
-
-def number(value: float | None) -> str:
-    """Six digits; a dash for what does not exist."""
-    return "–" if value is None else f"{value:.6g}"
