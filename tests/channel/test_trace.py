@@ -132,6 +132,7 @@ def test_rows_of_a_packet_are_one_fate(tmp_path: Path, rows: str, arrived: list[
         (HEAD.encode() + b"1,2\n", "trace.csv:2: got 2 fields; allowed: 3"),
         (HEAD.encode() + b"1,2,x\n", "trace.csv:2: delivered_ns: got 'x'; allowed: a whole number, or nothing for a"),
         (HEAD.encode() + b"1,2,3\n,2,3\n", "trace.csv:3: seq: got ''; allowed: a whole number$"),
+        (HEAD.encode() + b"9" * 5000 + b",2,3\n", "trace.csv:2: seq: got '9{40}'; allowed: a whole number$"),
         (HEAD.encode() + b"1,2,3\n4,2,3\n", "no row for packet 2; allowed: a row for each from 1 to 4, with"),
     ],
 )

@@ -20,8 +20,8 @@ from testbed.channel.gilbert_elliott import GilbertElliott
 from testbed.numerics.lanes import Bools, Floats
 
 NAMES = ("to_bad", "to_good", "loss_good", "loss_bad")
-EM_STEPS = 15
-_BEST = 2  # starting points that are followed to the end
+EM_STEPS = 8
+_BEST = 3  # starting points that are followed to the end
 _LOGIT_MAX = 14.0
 _SAME = 1e-6  # of the log-likelihood: what a parameter at 0 or 1 may cost
 _INDEPENDENT = float(chdtri(3, 0.05))  # gain in 2 log of the likelihood by three parameters that says nothing

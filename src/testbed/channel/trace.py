@@ -85,6 +85,7 @@ def read_fates(path: Path) -> Fates:
         raise UsageError(f"{path}: not a trace; {_ALLOWED}") from None
 
 
+_DIGITS_MAX = 20  # of 64 bits
 _ALLOWED = f"allowed: CSV in UTF-8 with the header {','.join(HEADER)}"
 
 
@@ -118,7 +119,7 @@ def _fates(path: Path, rows: Any) -> Fates:
 def _whole(where: str, name: str, text: str) -> int | None:
     if not text and name == "delivered_ns":
         return None
-    if not text.removeprefix("-").isdecimal():
+    if len(text) > _DIGITS_MAX or not text.removeprefix("-").isdecimal():
         none = ", or nothing for a lost packet" if name == "delivered_ns" else ""
         raise UsageError(f"{where}: {name}: got {text[:40]!r}; allowed: a whole number{none}")
     return int(text)
