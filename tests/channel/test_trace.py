@@ -1,4 +1,4 @@
-"""TRACE.csv: its rows, its figures, and that lanes and seeds are those of a run."""
+"""TRACE.csv: its rows, its figures, that lanes and seeds are those of a run; and what is read from one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from testbed.channel.service import loss_process
-from testbed.channel.trace import sample_trace, write_trace
+from testbed.channel.trace import read_fates, sample_trace, write_trace
+from testbed.errors import UsageError
 from testbed.scenario import Scenario, parse_scenario
 
 
@@ -92,3 +93,55 @@ def test_a_perfect_ack_link_loses_nothing() -> None:
     )
     assert sample_trace(perfect, "ack", 50, seed=1).figures()["dropped"] == 0
     assert sample_trace(given, "control", 50, seed=1).figures()["dropped"] == 0
+
+
+def test_what_was_written_is_read(tmp_path: Path) -> None:
+    trace = sample_trace(scenario(MARKOV), "observation", 300, seed=2)
+    write_trace(tmp_path / "trace.csv", trace)
+    fates = read_fates(tmp_path / "trace.csv")
+    assert fates.arrived.tolist() == [delivered is not None for _, _, delivered in trace.rows]
+    assert fates.duplicates == 0
+
+
+HEAD = "seq,sent_ns,delivered_ns\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "arrived", "duplicates"),
+    [
+        ("", [], 0),
+        ("5,0,\n6,1,9\n", [False, True], 0),
+        ("6,1,9\n5,0,\n", [False, True], 0),  # late
+        ("5,0,3\n6,1,\n5,0,4\n", [True, False], 1),
+        ("5,0,\n5,0,4\n5,0,\n", [True], 2),  # copies of which one came through
+        ("\r\n5, 0, 3 \r\n\r\n6,1,\r\n", [True, False], 0),
+    ],
+)
+def test_rows_of_a_packet_are_one_fate(tmp_path: Path, rows: str, arrived: list[bool], duplicates: int) -> None:
+    (tmp_path / "trace.csv").write_text(HEAD + rows)
+    fates = read_fates(tmp_path / "trace.csv")
+    assert (fates.arrived.tolist(), fates.duplicates) == (arrived, duplicates)
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        (b"", "trace.csv: not a trace: got an empty file; allowed: CSV in UTF-8 with the header seq,sent_ns,"),
+        (b"time,value\n1,2\n", "trace.csv: not a trace: got the header 'time,value'; allowed"),
+        (b"\x89PNG\xff", "trace.csv: not a trace; allowed: CSV"),
+        (HEAD.encode() + b"1,2\n", "trace.csv:2: got 2 fields; allowed: 3"),
+        (HEAD.encode() + b"1,2,x\n", "trace.csv:2: delivered_ns: got 'x'; allowed: a whole number, or nothing for a"),
+        (HEAD.encode() + b"1,2,3\n,2,3\n", "trace.csv:3: seq: got ''; allowed: a whole number$"),
+        (HEAD.encode() + b"9" * 5000 + b",2,3\n", "trace.csv:2: seq: got '9{40}'; allowed: a whole number$"),
+        (HEAD.encode() + b"1,2,3\n4,2,3\n", "no row for packet 2; allowed: a row for each from 1 to 4, with"),
+    ],
+)
+def test_what_is_no_trace_is_refused(tmp_path: Path, text: bytes, error: str) -> None:
+    (tmp_path / "trace.csv").write_bytes(text)
+    with pytest.raises(UsageError, match=error):
+        read_fates(tmp_path / "trace.csv")
+
+
+def test_a_trace_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"cannot read .*none\.csv: no such file"):
+        read_fates(tmp_path / "none.csv")

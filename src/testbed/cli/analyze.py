@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from testbed.cli.tables import row as _row
+from testbed.cli.tables import table as _table
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -150,21 +153,6 @@ def _law(end: float, quantile: int | None) -> str:
         return "of length 1" if end else "never end"
     text = f"{_number(end)} · {_number(1.0 - end)}^(l−1), mean {_number(1.0 / end)}"
     return text if quantile is None else f"{text}, 99 % at most {quantile}"
-
-
-def _table(*heads: str) -> Table:
-    from rich.table import Table
-
-    table = Table(*heads, box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
-    for column in table.columns[:-1]:
-        column.no_wrap = True
-    return table
-
-
-def _row(table: Table, *cells: str) -> None:
-    from rich.text import Text
-
-    table.add_row(*(Text(cell) for cell in cells))
 
 
 def _number(value: float | None) -> str:

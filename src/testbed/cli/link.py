@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_format
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
@@ -11,7 +12,7 @@ import typer
 from testbed.errors import UsageError, did_you_mean
 from testbed.wire.keys import LinkName
 
-app = typer.Typer(help="Look at one link of a scenario.", rich_markup_mode=None)
+app = typer.Typer(help="Look at one link: of a scenario, or of a trace.", rich_markup_mode=None)
 
 _LANE_MAX = 2**31 - 2  # the last lane of the largest scenario
 
@@ -60,6 +61,33 @@ def sample(
         f"(expected {expected:.6g}), mean burst {_shown(figures['mean_burst'])} "
         f"(expected {_shown(figures['expected_mean_burst'])}); {out}"
     )
+
+
+@app.command()
+def fit(
+    trace: Annotated[Path, typer.Argument(metavar="TRACE.csv", help="A trace, as `testbed link sample` writes it.")],
+    json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+) -> None:
+    """Fit Bernoulli, Markov and Gilbert-Elliott losses to a trace by maximum likelihood, and choose by BIC.
+
+    Shows the parameters with 95 % intervals, whether the lengths of bursts and gaps fit, and the line for the
+    scenario. A packet with several rows is one packet, which arrived if one of them has delivered_ns.
+    """
+    from testbed.analysis.fit import fit_losses
+    from testbed.channel.trace import read_fates
+
+    fates = read_fates(trace)
+    try:
+        fitted = fit_losses(fates.arrived)
+    except UsageError as error:
+        raise UsageError(f"{trace}: {error}") from None
+    if json:
+        figures = {"duplicates": fates.duplicates, **asdict(fitted)}
+        typer.echo(json_format.dumps(figures, allow_nan=False))
+        return
+    from testbed.cli.fit_tables import show
+
+    show(str(trace), fitted, fates.duplicates)
 
 
 def _link(name: str) -> LinkName:
