@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from testbed.channel.loss import Chain, LossProcess
 from testbed.errors import UsageError
+from testbed.numerics.chances import happens
 from testbed.numerics.lanes import Mask
 from testbed.numerics.streams import Stream
 
@@ -163,9 +162,8 @@ class GilbertElliottProcess:
     def next(self, number: int) -> Mask:
         """Arrival mask of packet ``number``: a ``bool`` for one lane, else a boolean array of shape (M,)."""
         good = self._states.next(number)
-        (uniform,) = self._drops.uniforms(number)
         bad_arrival, good_arrival = self._arrival
         if isinstance(good, bool):
+            (uniform,) = self._drops.uniforms(number)
             return bool(uniform < (good_arrival if good else bad_arrival))
-        arrived: Mask = uniform < np.where(good, good_arrival, bad_arrival)
-        return arrived
+        return happens(self._drops.words(number)[0], good, bad_arrival, good_arrival)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from testbed.numerics.chances import happens
 from testbed.numerics.lanes import Mask
 from testbed.numerics.streams import Stream
 
@@ -100,6 +101,10 @@ class LossProcess:
         """Arrival mask of packet ``number``: a ``bool`` for one lane, else a boolean array of shape (M,)."""
         if self.chain.never_loses:
             return True if self._lanes == 1 else np.ones(self._lanes, dtype=np.bool_)
+        if self._lanes > 1 and self._last is not None:
+            recovery, stays = self.chain.recovery, 1.0 - self.chain.failure
+            self._last = happens(self._stream.words(number)[0], self._last, recovery, stays)
+            return self._last
         (uniform,) = self._stream.uniforms(number)
         self._last = uniform < self.chain.arrival_given(self._last)
         return self._last

@@ -49,22 +49,33 @@ class Stream:
         """``width`` components, uniform on [0, 1)."""
         return self._row(self._uniform, self._width, step)
 
+    def words(self, step: int) -> NDArray[np.uint64]:
+        """(width, lanes): what ``uniforms`` of the step are 2^-53 of."""
+        ahead, offset = self._drawn(self._uniform.__name__, self._width, step)
+        row: NDArray[np.uint64] = ahead.raw[offset]
+        return row
+
     def normals(self, step: int) -> Vector:
         """``width`` components, standard normal (Box and Muller)."""
         return self._row(self._normal, self._width + self._width % 2, step)
 
     def _row(self, law: Callable[[NDArray[np.uint64]], Floats], words: int, step: int) -> Vector:
-        number, offset = divmod(step, TILE * self._tiles)
-        ahead = self._ahead.get(law.__name__)
-        if ahead is None or ahead.number != number:
-            tiles = [self._raw_tile(number * self._tiles + i, words) for i in range(self._tiles)]
-            ahead = self._ahead[law.__name__] = _Ahead(number, np.concatenate(tiles) if len(tiles) > 1 else tiles[0])
+        ahead, offset = self._drawn(law.__name__, words, step)
         if self._lanes > _FEW:
             return list(law(ahead.raw[offset : offset + 1])[0])
         if ahead.rows is None:
             rows = law(ahead.raw)
             ahead.rows = rows[:, :, 0].tolist() if self._lanes == 1 else list(rows)
         return list(ahead.rows[offset])
+
+    def _drawn(self, law: str, words: int, step: int) -> tuple[_Ahead, int]:
+        """The random words for a law around a step, and where its own are."""
+        number, offset = divmod(step, TILE * self._tiles)
+        ahead = self._ahead.get(law)
+        if ahead is None or ahead.number != number:
+            tiles = [self._raw_tile(number * self._tiles + i, words) for i in range(self._tiles)]
+            ahead = self._ahead[law] = _Ahead(number, np.concatenate(tiles) if len(tiles) > 1 else tiles[0])
+        return ahead, offset
 
     def _raw_tile(self, number: int, words: int) -> NDArray[np.uint64]:
         """Random words of shape (TILE, words, lanes), 53 bits each."""
