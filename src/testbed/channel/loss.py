@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from testbed.numerics.chances import happens
+from testbed.numerics.chances import happens, prepare
 from testbed.numerics.lanes import Mask
 from testbed.numerics.streams import Stream
 
@@ -95,6 +95,7 @@ class LossProcess:
 
     def __init__(self, chain: Chain, stream: Stream, lanes: int) -> None:
         self.chain, self._stream, self._lanes = chain, stream, lanes
+        prepare(lanes)
         self._last: Mask | None = None
 
     def next(self, number: int) -> Mask:

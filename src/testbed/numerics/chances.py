@@ -24,6 +24,12 @@ def happens(words: NDArray[np.uint64], before: Bools, chance_no: float, chance_y
     return np.asarray(words.astype(np.float64) * _SCALE < np.where(before, chance_yes, chance_no))
 
 
+def prepare(lanes: int) -> None:
+    """Compile what ``happens`` needs for so many lanes, which takes a moment."""
+    if lanes >= LANES_MIN and available():
+        _compiled()
+
+
 @lru_cache
 def _compiled() -> Callable[..., None]:
     import numba
