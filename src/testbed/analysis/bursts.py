@@ -47,11 +47,6 @@ def delivered_run(chain: Chain) -> Sojourn:
     return Sojourn(chain.failure)
 
 
-def mean_lengths(chain: Chain) -> tuple[float, float]:
-    """Mean length of a burst of losses and of a run of deliveries; their shares are the stationary law."""
-    return lost_run(chain).mean, delivered_run(chain).mean
-
-
 @dataclass(frozen=True, eq=False)
 class PhaseType:
     """The law of a run of equal fates behind which states move: P(length = l) = α T^{l−1} (I − T) 1, l = 1, 2, …

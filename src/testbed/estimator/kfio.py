@@ -12,7 +12,7 @@ from testbed.errors import UsageError
 from testbed.estimator.errors import MissingAck
 from testbed.estimator.model import Ack, Estimate, Model, newest_ack
 from testbed.estimator.riccati import Gain, phi, predict
-from testbed.estimator.state import Given, State, start_of, state_of
+from testbed.estimator.state import OneGaussian
 from testbed.numerics.lanes import (
     Component,
     Floats,
@@ -33,7 +33,7 @@ from testbed.numerics.symbols import Shape
 from testbed.scenario import ConstantInput, Input, NoLoss, Scenario
 
 
-class Kfio:
+class Kfio(OneGaussian):
     """Optimal when every ν_{k−1} is known at step k.
 
     ν need not be acknowledged where the control link never loses or where B u = 0.
@@ -71,19 +71,6 @@ class Kfio:
         self._k += 1
         self._x, self._p = self._advance(gamma, self._x, self._p, push, nu, vector_of(y))
         return Estimate(self._x, self._p, self._lanes)
-
-    def state(self) -> State:
-        return state_of(self._k, self._lanes, {"x": self._x, "P": self._p})
-
-    def set_state(self, state: State) -> None:
-        given = Given(state, self._lanes, self._model.n)
-        x, p = given.vector("x"), given.matrix("P")
-        given.end()
-        self._k, self._x, self._p = given.step, x, p
-
-    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
-        self._x, self._p = start_of(step, x_hat, P, self._lanes, self._model.n)
-        self._k = step
 
     def _nu(self, push: Vector, acks: tuple[Ack, ...]) -> Component:
         ack = newest_ack(acks, self._k, self.counters)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from testbed.errors import UsageError
 from testbed.estimator.model import Ack, Estimate, Model, expected_nu
 from testbed.estimator.riccati import Gain, phi, predict_with_mean_control
-from testbed.estimator.state import Given, State, start_of, state_of
+from testbed.estimator.state import OneGaussian
 from testbed.numerics.lanes import (
     Component,
     Floats,
@@ -26,7 +26,7 @@ from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 
-class Lmmse:
+class Lmmse(OneGaussian):
     """Linear: the control enters with its mean, its variance counts as noise, the gain is that of the whole P.
 
     An ACK of ν_{k−1} in time replaces the mean ν̄ of that packet by ν itself, so that with every ACK it is KFIO.
@@ -58,19 +58,6 @@ class Lmmse:
             vector_of(y),
         )
         return Estimate(self._x, self._p, self._lanes)
-
-    def state(self) -> State:
-        return state_of(self._k, self._lanes, {"x": self._x, "P": self._p})
-
-    def set_state(self, state: State) -> None:
-        given = Given(state, self._lanes, self._model.n)
-        x, p = given.vector("x"), given.matrix("P")
-        given.end()
-        self._k, self._x, self._p = given.step, x, p
-
-    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
-        self._x, self._p = start_of(step, x_hat, P, self._lanes, self._model.n)
-        self._k = step
 
 
 def _advance(

@@ -91,15 +91,6 @@ class Fates:
         return np.where(arrived, 0.0, ahead), np.where(arrived, ahead, 0.0)
 
 
-def point(step: int, mean: Floats, covariance: Floats, law_ahead: Floats) -> Posterior:
-    """One Gaussian; law_ahead (S,): of the hidden state of the next packet."""
-    n = len(mean)
-    return Posterior(
-        step, mean, np.zeros((n, n)), np.zeros((1, n)), np.zeros((1, n)), (), law_ahead[:, None, None].copy(),
-        np.zeros((1, 1)), covariance, True,
-    )  # fmt: skip
-
-
 def predicted(posterior: Posterior, model: Model, fates: Fates, push: Floats, nu: int | None) -> Posterior:
     """The move of the plant under B u = push; each history splits in two unless ν is known.
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from testbed.channel.law import Law
 from testbed.errors import UsageError, did_you_mean
+from testbed.estimator.model import Model
 from testbed.numerics.lanes import (
     Component,
     Floats,
@@ -93,6 +94,29 @@ def start_of(step: int, x_hat: Floats, P: Floats, lanes: int, n: int) -> tuple[V
     if (np.linalg.eigvalsh(unit) < -_ROUNDING).any():
         raise UsageError("start: P has a negative eigenvalue")
     return mean, covariance
+
+
+class OneGaussian:
+    """The restart of an estimator that knows x̂ and P and nothing else: ``_k`` steps, ``_x`` and ``_p``."""
+
+    _model: Model
+    _lanes: int
+    _k: int
+    _x: Vector
+    _p: Matrix
+
+    def state(self) -> State:
+        return state_of(self._k, self._lanes, {"x": self._x, "P": self._p})
+
+    def set_state(self, state: State) -> None:
+        given = Given(state, self._lanes, self._model.n)
+        x, p = given.vector("x"), given.matrix("P")
+        given.end()
+        self._k, self._x, self._p = given.step, x, p
+
+    def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        self._x, self._p = start_of(step, x_hat, P, self._lanes, self._model.n)
+        self._k = step
 
 
 def last_law(law: Law, step: int) -> Floats:
