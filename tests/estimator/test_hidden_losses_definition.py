@@ -15,7 +15,6 @@ from estimator.reference.cases import ACKS, HIDDEN, Channel, Floats, Trial, chec
 from estimator.reference.drive import losses_of, model_of, run
 from testbed.channel.law import law_of
 from testbed.errors import UsageError
-from testbed.estimator.bounds import correlation_factor
 from testbed.estimator.registry import create
 
 HOLDING = [("aoe", {}), ("gpb", {"order": 0}), ("gpb", {"order": 2}), ("gpb1", {}), ("gpb2", {}), ("imm", {})]
@@ -153,7 +152,7 @@ def test_filters_for_independent_losses_refuse(kind: str) -> None:
 
 @check(40)
 @given(trials(chains=(HIDDEN,), steps=(6, 6), lanes=(1, 1)))
-def test_the_correlation_factor_covers_the_covariance_of_the_losses(trial: Trial) -> None:
+def test_the_covariance_factor_covers_the_covariance_of_the_losses(trial: Trial) -> None:
     """Row sums of |Cov(ν_i, ν_j)| over all histories are at most ¼ of it: Gershgorin's theorem does the rest."""
     system = trial.system
     histories = np.array(np.meshgrid(*[[0, 1]] * 6, indexing="ij")).reshape(6, -1)
@@ -161,6 +160,6 @@ def test_the_correlation_factor_covers_the_covariance_of_the_losses(trial: Trial
     assert priors.sum() == pytest.approx(1.0)
     away = histories - (histories @ priors)[:, None]
     covariance = (away * priors) @ away.T
-    factor = correlation_factor(losses_of(system))
+    factor = losses_of(system).covariance_factor
     assert factor is not None
     assert np.abs(covariance).sum(axis=1).max() <= 0.25 * factor + 1e-12

@@ -23,6 +23,7 @@ SYSTEM: dict[str, Any] = {
 }
 BASE: dict[str, Any] = {"system": SYSTEM, "estimators": [{"name": "oe"}]}
 ABSENT = object()
+KINDS = "none, bernoulli, markov, gilbert-elliott, four-state, trace, scripted"
 LOSS = "links.control.loss"
 _TO_GOOD = "Probability that a bad state is followed by a good one, 0 … 1"
 NAN, INF = float("nan"), float("inf")
@@ -142,16 +143,16 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     ({"links.control.on_loss": "noise"}, "links.control: unknown key 'on_loss'; did you mean 'loss'?"),
     # losses
-    ({f"{LOSS}.arrival": 0.5}, f"{LOSS}.kind: missing; allowed: none, bernoulli, markov, gilbert-elliott"),
+    ({f"{LOSS}.arrival": 0.5}, f"{LOSS}.kind: missing; allowed: {KINDS}"),
     (
         {f"{LOSS}.kind": "bernouli"},
-        f"{LOSS}.kind: got 'bernouli'; allowed: none, bernoulli, markov, gilbert-elliott; did you mean 'bernoulli'?",
+        f"{LOSS}.kind: got 'bernouli'; allowed: {KINDS}; did you mean 'bernoulli'?",
     ),
     (
         {LOSS: "bernoulli"},
-        f"{LOSS}: got 'bernoulli'; allowed: a table with a kind: none, bernoulli, markov, gilbert-elliott",
+        f"{LOSS}: got 'bernoulli'; allowed: a table with a kind: {KINDS}",
     ),
-    ({LOSS: {"kind": ["markov"]}}, f"{LOSS}.kind: got ['markov']; allowed: none, bernoulli, markov, gilbert-elliott"),
+    ({LOSS: {"kind": ["markov"]}}, f"{LOSS}.kind: got ['markov']; allowed: {KINDS}"),
     ({LOSS: {"kind": "bernoulli", "arival": 0.5}}, f"{LOSS}: unknown key 'arival'; did you mean 'arrival'?"),
     (
         {LOSS: {"kind": "bernoulli", "loss": 0.5, "arival": 0.5}},
@@ -205,8 +206,7 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {LOSS: {"kind": "gilbert", "to_bad": 0.1, "to_good": 0.5}},
-        f"{LOSS}.kind: got 'gilbert'; allowed: none, bernoulli, markov, gilbert-elliott; did you mean "
-        "'gilbert-elliott'?",
+        f"{LOSS}.kind: got 'gilbert'; allowed: {KINDS}; did you mean 'gilbert-elliott'?",
     ),
     (
         {"links.ack.loss": {"kind": "bernoulli", "arrival": 0.5}},

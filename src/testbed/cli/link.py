@@ -74,7 +74,7 @@ def fit(
     scenario. A packet with several rows is one packet, which arrived if one of them has delivered_ns.
     """
     from testbed.analysis.fit import fit_losses
-    from testbed.channel.trace import read_fates
+    from testbed.scenario.trace_file import read_fates
 
     fates = read_fates(trace)
     try:

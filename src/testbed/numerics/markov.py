@@ -50,7 +50,7 @@ def _eliminated(transition: Floats) -> Floats:
     law = np.ones(len(rates))
     for h in range(1, len(rates)):
         law[h] = law[:h] @ rates[:h, h]
-    return law / law.sum()
+    return np.asarray(law / law.sum())
 
 
 def mixing_sums(transition: Floats, law: Floats, steps: int) -> tuple[Floats, Floats]:
@@ -72,8 +72,8 @@ _FORGOTTEN = 1e-18
 def summed_ranges(transition: Floats, values: Floats) -> float | None:
     """A bound of Σ_{j≥1} (max − min of T^j values), T = transition (H, H), values (H,); None where none is found.
 
-    Exactly for 64 terms; then the sum of the next 2^i terms is at most that of all before times τ(T^j), with Dobrushin's
-    coefficient τ: max − min of T^j v is at most τ(T^j) (max − min of v).
+    Exactly for 64 terms; then the sum of the next 2^i terms is at most that of all before times τ(T^j), by
+    Dobrushin's coefficient τ: max − min of T^j v is at most τ(T^j) (max − min of v).
     """
     total, power = 0.0, transition
     if len(values) == 2:  # there the bound is exact from the first term

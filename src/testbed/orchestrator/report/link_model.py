@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from testbed.analysis.bursts import run_law
 from testbed.channel.chains import chain_of
-from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.hidden import Hidden
 from testbed.channel.law import LossModel
 from testbed.orchestrator.summary import LinkFigures, Summary
 from testbed.scenario import Loss
@@ -48,15 +48,15 @@ def expected_links(summary: Summary, scenario_toml: str) -> dict[str, Expected]:
 
 
 def _expected(losses: LossModel, figures: LinkFigures, lanes: int) -> Expected:
-    """Lanes are independent; within a lane packets j apart have correlation coupling · memory^j.
+    """Lanes are independent; within a lane packets are correlated as the model says.
 
     The spread is that of the stationary law. Bursts of a chain of arrivals are geometric with parameter `recovery`;
     those that the end of the run cuts short are not allowed for.
     """
-    arrival, spread = _arrivals(losses, steps=max(1, round(figures.sent / lanes)))
+    arrival, variance = losses.share_moments(max(1, round(figures.sent / lanes)))
     return Expected(
         loss_rate=1.0 - arrival,
-        loss_rate_deviation=spread / math.sqrt(lanes),
+        loss_rate_deviation=math.sqrt(max(0.0, variance) / lanes),
         mean_burst=None if losses.never_loses else losses.mean_burst,
         mean_burst_deviation=_burst_spread(losses, figures.transitions.delivered_lost),
     )
@@ -64,20 +64,8 @@ def _expected(losses: LossModel, figures: LinkFigures, lanes: int) -> Expected:
 
 def _burst_spread(losses: LossModel, bursts: int) -> float | None:
     """Standard deviation of the mean length of that many bursts."""
-    if isinstance(losses, GilbertElliott):
+    if isinstance(losses, Hidden):
         law = run_law(losses, False)
         return math.sqrt(law.variance_of_mean / bursts) if law is not None and bursts else None
     recovery = losses.recovery
     return math.sqrt((1.0 - recovery) / bursts) / recovery if recovery and bursts else None
-
-
-def _arrivals(losses: LossModel, steps: int) -> tuple[float, float]:
-    """Mean share of arrivals in one lane over `steps` steps, and its standard deviation."""
-    states = losses.states if isinstance(losses, GilbertElliott) else losses
-    leaving = states.recovery + states.failure
-    rho = 1.0 - leaving
-    geometric = (1.0 - rho**steps) / leaving  # Σ ρ^j, j = 0 … steps − 1
-    correlated = rho * (steps - geometric) / leaving  # Σ (steps − j) ρ^j, j = 1 … steps − 1
-    variance = losses.arrival * (1.0 - losses.arrival) * (steps + 2.0 * losses.coupling * correlated) / steps**2
-    mean = losses.arrival + (losses.first_arrival - losses.arrival) * geometric / steps
-    return mean, math.sqrt(max(0.0, variance))
