@@ -146,7 +146,7 @@ class Hidden(ABC):
             return 1.0
         here = reached(self.initial > 0.0, self.transition)
         arrives = 1.0 - self.loss[here]
-        ahead = summed_ranges(self.transition[np.ix_(here, here)], arrives)
+        ahead = summed_ranges(self.transition[np.ix_(here, here)], self.stationary[here], arrives)
         return None if ahead is None else 1.0 + 2.0 * float(np.ptp(arrives)) * ahead
 
     def share_moments(self, packets: int) -> tuple[float, float]:

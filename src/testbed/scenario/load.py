@@ -95,7 +95,10 @@ def _read_trace(link: str, table: dict[str, Any], base_dir: Path) -> dict[str, A
         return table
 
     def read(path: Path, name: str) -> str:
-        return read_fates(path, name).word
+        word = read_fates(path, name).word
+        if not word:
+            raise UsageError(f"{name}: no packets; allowed: a row for each packet")
+        return word
 
     return {**table, "loss": _read_in(f"links.{link}.loss", loss, base_dir, "fates", read)}
 

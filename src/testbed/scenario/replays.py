@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, WithJsonSchema, model_v
 from testbed.scenario.base import COUNT_MAX, Part, count, problem, sequence, shown
 from testbed.scenario.loss_laws import BernoulliLoss, LossLaw, MarkovLoss, NoLoss
 
+WORD_PATTERN = r"^[01]+$"
 _ASSUMED = (
     "What estimators and theorems take the losses for, a loss of kind none, bernoulli, markov, gilbert-elliott or "
     "four-state; left out: the Markov chain of the transitions counted {where}, from the last packet to the first too."
@@ -34,7 +35,7 @@ class TraceLoss(Part):
     other_keys: ClassVar[tuple[str, ...]] = ("file",)
 
     kind: Literal["trace"] = Field(default="trace", description="Kind of loss.")
-    fates: str = Field(pattern=r"^[01]+$", description="A letter for each packet: 1 arrived, 0 lost.")
+    fates: str = Field(pattern=WORD_PATTERN, description="A letter for each packet: 1 arrived, 0 lost.")
     offset: int | None = Field(
         default=None,
         ge=0,
@@ -128,7 +129,7 @@ class ScriptedLoss(Part):
     lost: Lost | None = Field(
         default=None, description='The numbers of the packets that are lost, and ranges of them: [3, 4, "10-12"].'
     )
-    pattern: Annotated[str, Field(pattern=r"^[01]+$")] | None = Field(
+    pattern: Annotated[str, Field(pattern=WORD_PATTERN)] | None = Field(
         default=None, description="A letter for each packet, over and over again: 1 arrives, 0 is lost."
     )
     assumed: LossLaw | None = Field(

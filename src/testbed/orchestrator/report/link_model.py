@@ -13,7 +13,7 @@ from testbed.channel.chains import chain_of
 from testbed.channel.hidden import Hidden
 from testbed.channel.law import LossModel
 from testbed.orchestrator.summary import LinkFigures, Summary
-from testbed.scenario import Loss
+from testbed.scenario import Loss, ScriptedLoss, TraceLoss
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ _LOSS: TypeAdapter[Loss] = TypeAdapter(Loss)
 
 
 def expected_links(summary: Summary, scenario_toml: str) -> dict[str, Expected]:
-    """What is expected of each link that sent a packet and whose loss is one of the scenario's loss models.
+    """What is expected of each link that sent a packet and whose losses are drawn by a law.
 
     Raises:
         tomllib.TOMLDecodeError: the scenario is not TOML.
@@ -39,11 +39,11 @@ def expected_links(summary: Summary, scenario_toml: str) -> dict[str, Expected]:
     expected = {}
     for name, figures in summary.links.items():
         try:
-            chain = chain_of(_LOSS.validate_python(tables.get(name, {}).get("loss", {"kind": "none"})))
+            loss = _LOSS.validate_python(tables.get(name, {}).get("loss", {"kind": "none"}))
         except ValidationError:
             continue
-        if figures.sent and summary.lanes:
-            expected[name] = _expected(chain, figures, summary.lanes)
+        if figures.sent and summary.lanes and not isinstance(loss, (TraceLoss, ScriptedLoss)):
+            expected[name] = _expected(chain_of(loss), figures, summary.lanes)
     return expected
 
 
