@@ -10,14 +10,12 @@ pauses that end sooner.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri, expit, logit
 
 from testbed.analysis.fit_chains import chain_log_likelihood, fit_markov
-from testbed.analysis.fit_intervals import Interval
-from testbed.analysis.fit_search import Certainty, Coordinates, at_boundary, climbed
+from testbed.analysis.fit_search import Certainty, Coordinates, Found, at_boundary, climbed
 from testbed.analysis.fit_states import Blocks, Expected
 from testbed.channel.four_state import BURST, GOOD, ISOLATED, PAUSE, four_state
 from testbed.channel.hidden import HiddenChain
@@ -33,21 +31,6 @@ _MARKOV = float(chdtri(3, 0.05))  # gain in 2 log of the likelihood by three par
 _NONE = (None,) * len(NAMES)
 _PAIRS = np.array([[BURST, ISOLATED], [GOOD, PAUSE]])
 """The states of a fate, lost and arrived."""
-
-
-@dataclass(frozen=True)
-class Found:
-    """The model of largest likelihood. ``intervals`` of NAMES and of the stationary loss.
-
-    Those of parameters at 0 and 1 are None, and the others are for these held there. Where the parameters cannot be
-    told from the fates, ``obstacle`` says why, and there are no intervals at all.
-    """
-
-    losses: HiddenChain
-    log_likelihood: float
-    intervals: tuple[Interval | None, ...]
-    loss_interval: Interval | None
-    obstacle: str = ""
 
 
 class Fates:
@@ -76,7 +59,7 @@ def _matrices(losses: HiddenChain) -> Floats:
     return np.array([losses.transition[np.ix_(before, after)] for before in _PAIRS for after in _PAIRS])
 
 
-def fit_four_state(fates: Bools) -> Found:
+def fit_four_state(fates: Bools) -> Found[HiddenChain]:
     """Of all four-state models; fates: (n,), True where a packet arrived, both kinds among them."""
     seen, chain = Fates(fates), fit_markov(fates)
     begun = []
@@ -119,7 +102,8 @@ def em(seen: Fates, losses: HiddenChain, steps: int) -> Iterator[tuple[HiddenCha
         target, values = _shares(losses, expected), _values(losses)
         for halvings in range(_HALVINGS):
             step = _model(_between(values, target, 0.5**halvings))
-            gained = seen.expected(step)
+            with np.errstate(all="ignore"):  # the likelihood of what cannot begin so is no number
+                gained = seen.expected(step)
             if gained.log_likelihood >= expected.log_likelihood:
                 break
         else:
@@ -196,10 +180,10 @@ def _named(losses: HiddenChain) -> HiddenChain:
     return losses if to_pause > 0.0 else four_state(to_burst, to_good, to_isolated=to_isolated)
 
 
-def _with_intervals(seen: Fates, losses: HiddenChain) -> Found:
+def _with_intervals(seen: Fates, losses: HiddenChain) -> Found[HiddenChain]:
     """Wald's in the logits of the parameters within (0, 1), the coordinates at 0 and 1 held."""
     reached, found = seen.log_likelihood(losses), Certainty.of(seen, _BY, losses)
-    if found.covariance is None:
+    if found.covariance is None and found.free.size:
         return Found(losses, reached, _NONE, None, "not identifiable: the information is singular")
     intervals = [
         found.interval(lambda at, i=before, j=after: at.moves[i][j])  # type: ignore[misc]

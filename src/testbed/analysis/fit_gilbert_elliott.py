@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri
 
 from testbed.analysis.fit_chains import chain_log_likelihood, fit_bernoulli, fit_markov, stationary_rates
 from testbed.analysis.fit_intervals import Interval, around
-from testbed.analysis.fit_search import Certainty, Coordinates, at_boundary, climbed
+from testbed.analysis.fit_search import Certainty, Coordinates, Found, at_boundary, climbed
 from testbed.analysis.fit_states import Expected, Fates
 from testbed.channel.gilbert_elliott import GilbertElliott
 from testbed.numerics.lanes import Bools, Floats
@@ -22,22 +21,7 @@ _INDEPENDENT = float(chdtri(3, 0.05))  # gain in 2 log of the likelihood by thre
 _NONE = (None,) * len(NAMES)
 
 
-@dataclass(frozen=True)
-class Found:
-    """The channel of largest likelihood. ``intervals`` of NAMES and of the stationary loss.
-
-    Those of parameters at 0 and 1 are None, and the others are for these held there. Where the parameters cannot be
-    told from the fates, ``obstacle`` says why, and there are no intervals at all.
-    """
-
-    losses: GilbertElliott
-    log_likelihood: float
-    intervals: tuple[Interval | None, ...]
-    loss_interval: Interval | None
-    obstacle: str = ""
-
-
-def fit_gilbert_elliott(fates: Bools) -> Found:
+def fit_gilbert_elliott(fates: Bools) -> Found[GilbertElliott]:
     """Of all channels with loss_good ≤ loss_bad; fates: (n,), True where a packet arrived, both kinds among them."""
     seen = Fates(fates)
     begun = []
@@ -127,7 +111,7 @@ def _ordered(losses: GilbertElliott) -> GilbertElliott:
     return GilbertElliott.of(states.recovery, states.failure, losses.loss_bad, losses.loss_good)
 
 
-def _with_intervals(seen: Fates, losses: GilbertElliott) -> Found:
+def _with_intervals(seen: Fates, losses: GilbertElliott) -> Found[GilbertElliott]:
     """Wald's in the logits of the parameters within (0, 1), the others held."""
     reached, found = seen.log_likelihood(losses), Certainty.of(seen, _BY, losses)
     if not found.free.size:

@@ -16,15 +16,32 @@ from scipy.special import expit, logit
 
 from testbed.analysis.fit_intervals import Interval, around
 from testbed.analysis.fit_states import Expected
+from testbed.channel.hidden import Hidden
 from testbed.numerics.lanes import Floats
 
 T = TypeVar("T")
 M = TypeVar("M", contravariant=True)
+H = TypeVar("H", bound=Hidden, covariant=True)
 _LOGIT_MAX = 14.0
 _SAME = 1e-6  # of the log-likelihood: what a coordinate at 0 or 1 may cost
 _NEAR = 0.01
 _STEP = 1e-4  # in the logits
 _SINGULAR = 1e-4  # least eigenvalue of the information, scaled to ones on its diagonal
+
+
+@dataclass(frozen=True)
+class Found(Generic[H]):
+    """The model of largest likelihood, with 95 % intervals of its parameters and of its stationary loss.
+
+    Those of parameters at 0 and 1 are None, and the others are for these held there. Where the parameters cannot be
+    told from the fates, ``obstacle`` says why, and there are no intervals at all.
+    """
+
+    losses: H
+    log_likelihood: float
+    intervals: tuple[Interval | None, ...]
+    loss_interval: Interval | None
+    obstacle: str = ""
 
 
 class Seen(Protocol[M]):
