@@ -10,7 +10,7 @@ from testbed.channel.carriers import carriers_of
 from testbed.channel.chains import chain_of
 from testbed.channel.delay import cdf_of
 from testbed.channel.gilbert_elliott import GilbertElliott
-from testbed.channel.hidden import HiddenChain
+from testbed.channel.hidden import Hidden, HiddenChain
 from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain, LossCounts
 from testbed.channel.steps import SteppedLink
@@ -61,19 +61,15 @@ def _exact(link: SteppedImpairments, period_ns: int) -> LossModel:
     return _simplest(HiddenChain(tuple(initial), tuple(map(tuple, moves)), tuple(loss)))
 
 
-def _simplest(losses: GilbertElliott | HiddenChain) -> LossModel:
+def _simplest(losses: Hidden) -> LossModel:
     chain = losses.as_chain
     return losses if chain is None else chain
 
 
 def _hidden_form(losses: LossModel) -> tuple[Floats, Floats, Floats]:
     """(initial, transition, loss) of the states; of two of them the bad one first."""
-    if isinstance(losses, GilbertElliott):
-        initial, moves, _ = _hidden_form(losses.states)
-        return initial, moves, np.array([losses.loss_bad, losses.loss_good])
     if isinstance(losses, Chain):
-        moves = np.array([[1.0 - losses.recovery, losses.recovery], [losses.failure, 1.0 - losses.failure]])
-        return np.array([1.0 - losses.start, losses.start]), moves, np.array([1.0, 0.0])
+        losses = GilbertElliott(losses, 0.0, 1.0)
     return losses.initial, losses.transition, losses.loss
 
 

@@ -11,9 +11,8 @@ import numpy as np
 from testbed import __version__
 from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
-from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.hidden import Hidden
 from testbed.channel.in_time import law_in_steps
-from testbed.estimator.bounds import correlation_factor
 from testbed.estimator.service import acks_of, role_of
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import (
@@ -94,7 +93,7 @@ def moment_checks(scenario: Scenario) -> list[Check]:
     """Whether the EEC and the variance of its sample mean can be finite."""
     A, losses = np.array(scenario.system.A), law_in_steps(scenario.links.observation, scenario.clock.period_ns)
     order, rho, decay = finite_moment_order(A, losses), spectral_radius(A), losses.burst_decay
-    hidden = isinstance(losses, GilbertElliott)
+    hidden = isinstance(losses, Hidden)
     burst = f"θ = {decay:.6g}" if hidden else f"P(arrival after a loss) = {losses.recovery:.6g}"
     where, factor = f"ρ(A) = {rho:.6g}, {burst}", "θ" if hidden else "(1 − recovery)"
     growth = rho * rho  # a power would raise where this is infinite
@@ -233,7 +232,7 @@ def _bounds(conductor: Conductor) -> BoundFigures | None:
         upper["upper_correlated_mean"] = series.mean["upper_correlated"]
         upper["upper_correlated_stderr"] = series.stderr["upper_correlated"]
     reason: str | None = None
-    if correlation_factor(law_in_steps(scenario.links.control, scenario.clock.period_ns)) is None:
+    if law_in_steps(scenario.links.control, scenario.clock.period_ns).covariance_factor is None:
         reason = "the control losses never mix, and S holds for independent ones"
     if scenario.uncertainty is not None:
         reason = "the bounds are those of the nominal model, and the plant departs from it"

@@ -85,7 +85,7 @@ class Scenario(Part):
                 "allowed there: nothing",
                 "observation.on_loss",
             )
-        return links
+        return links.of_run(info.data["steps"]) if "steps" in info.data else links
 
     @field_validator("input")
     @classmethod
