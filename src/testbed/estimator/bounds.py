@@ -12,9 +12,11 @@ of the losses.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache, partial
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from testbed.estimator.model import Model
@@ -28,18 +30,53 @@ class CovarianceBound:
     """P_{k+1} = φ(A P_k A' + noise, γ_{k+1}) from P_0 in every lane: Pᴬ with noise Q, S with Q + ¼U."""
 
     def __init__(self, model: Model, noise: Floats, lanes: int) -> None:
-        _, self._p = model.prior(lanes)
+        _, self.p = model.prior(lanes)
         self._advance = _stepper(model, constant(noise), lanes)
 
     def step(self, arrived: NDArray[Any]) -> Matrix:
         """The bound after the observations ``arrived`` (M,) of the next step."""
-        (self._p,) = self._advance(mask_of(arrived), self._p)
-        return self._p
+        (self.p,) = self._advance(mask_of(arrived), self.p)
+        return self.p
 
 
 def upper_bound(model: Model, U: Floats, lanes: int) -> CovarianceBound:
     """S for an input with B u_k u_k' B' ≤ U for all k."""
     return CovarianceBound(model, model.Q + 0.25 * U, lanes)
+
+
+class LateBound:
+    """Pᴬ_k given all observations of steps 1 … k that have arrived by k, late ones too.
+
+    Steps are remembered for ``depth``. What comes later than that counts as not arrived, and ``old`` counts it.
+    """
+
+    def __init__(self, model: Model, lanes: int, depth: int) -> None:
+        self._bound = CovarianceBound(model, model.Q, lanes)
+        self._depth, self._k, self.old = depth, 0, 0
+        self._states: dict[int, tuple[Matrix, NDArray[Any]]] = {}
+        """By step: what was known before it, and where its observation has arrived."""
+
+    def step(self, arrived: NDArray[Any], late: Iterable[tuple[int, NDArray[Any]]] = ()) -> Matrix:
+        """The bound after the next step's observations ``arrived`` (M,), and ``late`` ones: (step, lanes (M,))."""
+        again = self._k + 1
+        for step, lanes in late:
+            if step in self._states:
+                before, known = self._states[step]
+                self._states[step] = before, np.asarray(known, dtype=np.bool_) | np.asarray(lanes, dtype=np.bool_)
+                again = min(again, step)
+            else:
+                self.old += int(np.count_nonzero(lanes))
+        if again <= self._k:
+            self._bound.p = self._states[again][0]
+            for step in range(again, self._k + 1):
+                self._take(step, self._states[step][1])
+        self._k += 1
+        self._states.pop(self._k - self._depth, None)
+        return self._take(self._k, arrived)
+
+    def _take(self, step: int, arrived: NDArray[Any]) -> Matrix:
+        self._states[step] = self._bound.p, arrived
+        return self._bound.step(np.asarray(arrived, dtype=np.uint8))
 
 
 class Bounds:
