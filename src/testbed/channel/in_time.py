@@ -10,7 +10,7 @@ from testbed.channel.carriers import carriers_of
 from testbed.channel.chains import chain_of
 from testbed.channel.delay import cdf_of
 from testbed.channel.gilbert_elliott import GilbertElliott
-from testbed.channel.hidden import HiddenChain
+from testbed.channel.hidden import Hidden, HiddenChain
 from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain, LossCounts
 from testbed.channel.steps import SteppedLink
@@ -64,7 +64,7 @@ def _exact(link: SteppedImpairments, period_ns: int) -> LossModel:
     return _simplest(HiddenChain(tuple(initial), tuple(map(tuple, moves)), tuple(loss)))
 
 
-def _simplest(losses: GilbertElliott | HiddenChain) -> LossModel:
+def _simplest(losses: Hidden) -> LossModel:
     chain = losses.as_chain
     return losses if chain is None else chain
 
