@@ -15,6 +15,7 @@ from testbed.conformance.result import Failed, Skipped
 from testbed.errors import UsageError
 from testbed.estimator.errors import MissingAck
 from testbed.estimator.model import Estimator, Model
+from testbed.estimator.registry import check_actuator
 from testbed.numerics.lanes import Floats
 
 STEPS = 9
@@ -64,6 +65,7 @@ class Subject:
 
     def make(self, case: Case, lane: int = 0) -> Estimator:
         made: Estimator = self.factory(case.model, case.lanes, **self.options)
+        check_actuator(made, case.model)
         begin_at = getattr(made, "begin_at", None)
         if begin_at is not None:
             begin_at(lane)

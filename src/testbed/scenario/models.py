@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from testbed.errors import did_you_mean
+from testbed.scenario.actuator import Actuator
 from testbed.scenario.base import Count, Part, count, problem, shown, size
 from testbed.scenario.estimators import EstimatorSpec
 from testbed.scenario.inputs import ConstantInput, FeedbackInput, Input, TableInput, check_channels
@@ -45,6 +46,7 @@ class Scenario(Part):
     estimators: Annotated[tuple[EstimatorSpec, ...], Field(strict=False)] = Field(
         default=(), description="The estimators, all on the same packets."
     )
+    actuator: Actuator = Field(default_factory=Actuator, description="What the plant applies where u is lost.")
     input: Input | None = Field(default_factory=_no_input, description="The input u; default zero. Only with system.B.")
     links: Links = Field(default_factory=Links, description="The links between the parts.")
     transport: Transport = Field(default_factory=Transport, description="How the processes of a run talk.")
@@ -68,6 +70,14 @@ class Scenario(Part):
             if spec.until is not None and steps is not None and spec.until > steps:
                 raise problem(f"got {spec.until}; allowed: 1 … {steps}, the steps of the scenario", f"[{i}].until")
         return specs
+
+    @field_validator("actuator")
+    @classmethod
+    def _check_actuator(cls, actuator: Actuator, info: ValidationInfo) -> Actuator:
+        system: System | None = info.data.get("system")
+        if actuator.on_loss == "hold" and system is not None and system.B is None:
+            raise problem("got 'hold', but system.B is not given; allowed: zero, or hold with system.B", "on_loss")
+        return actuator
 
     @field_validator("input")
     @classmethod
