@@ -25,7 +25,7 @@ class BoundsService:
 
     def __init__(self, node: Node, setup: Setup) -> None:
         model, bound = model_of(setup.scenario), control_bound(setup.scenario)
-        factor = correlation_factor(model.control)
+        factor = None if model.holds else correlation_factor(model.control)
         self._blocks = {lane: Bounds(model, bound, lanes) for lane, lanes in setup.blocks}
         self._correlated = {
             lane: upper_bound(model, factor * bound, lanes)

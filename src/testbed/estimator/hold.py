@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from testbed.errors import UsageError
 from testbed.estimator.mixtures import Part
@@ -131,7 +133,7 @@ def refuse_moments(model: Model, step: int) -> None:
         )
 
 
-def applied_inputs(u: Floats, nu: Floats, before: Floats | None = None) -> Floats:
+def applied_inputs(u: Floats, nu: NDArray[Any], before: Floats | None = None) -> Floats:
     """a_0, a_1, … (T, q, M) of an actuator that holds, from u (T, q, M) as sent and ν (T, M).
 
     before (q, M): what was applied before the first; None: zero.
