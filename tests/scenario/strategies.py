@@ -154,6 +154,9 @@ def scenarios(draw: st.DrawFn) -> dict[str, Any]:
         "record": st.sampled_from(["first", "all", "none"]),
         "bounds": st.booleans(),
         "clock": clocks,
+        "actuator": st.fixed_dictionaries(
+            {}, optional={"on_loss": st.sampled_from(["zero", "hold"] if q else ["zero"])}
+        ),
         "links": st.fixed_dictionaries({}, optional={"control": links, "observation": observation_links, "ack": acks}),
         "transport": transports,
     }
