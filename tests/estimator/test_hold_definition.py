@@ -5,6 +5,7 @@ The reference says what is applied by looking for the newest arrival of a histor
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -17,7 +18,7 @@ from estimator.agreement import Run, assert_same
 from estimator.reference import gaussian, held
 from estimator.reference.cases import ACKS, HIDDEN, Trial, check, random_system, random_trial, systems, trials
 from estimator.reference.compare import smallest_eigenvalue
-from estimator.reference.drive import losses_of, model_of, run
+from estimator.reference.drive import acks_at, losses_of, model_of, run
 from estimator.reference.ff import ff
 from estimator.reference.histories import weighted_histories
 from estimator.reference.lmmse import lmmse
@@ -29,6 +30,7 @@ from testbed.estimator.errors import MissingAck, TooManyHistories
 from testbed.estimator.hold import applied_inputs
 from testbed.estimator.kfio_block import filter_block
 from testbed.estimator.model import Ack, Estimate, Model
+from testbed.estimator.packets import read_packets, replay
 from testbed.estimator.registry import create
 
 CHAINS = ("bernoulli", "markov", HIDDEN)
@@ -358,6 +360,23 @@ def test_oe_refuses_what_it_cannot_enumerate() -> None:
     filter_.predict(np.ones(1))
     with pytest.raises(TooManyHistories, match=r"oe would need 8 histories at step 3; .*or use gpb"):
         filter_.update(None)
+
+
+@pytest.mark.parametrize(
+    ("kind", "acks"), [("gpb", "late"), ("oe-exact", "late"), ("lmmse", "subset"), ("kfio", "all")]
+)
+def test_a_replay_has_the_estimates_of_the_steps(kind: str, acks: str) -> None:
+    trial = drawn(10, "bernoulli", acks, lanes=1)
+    model, lines = model_of(trial.system), []
+    for k in range(1, trial.steps + 1):
+        heard = [[ack.j, int(ack.nu[0])] for ack in acks_at(trial, k)]
+        y = trial.y[k - 1, 0].tolist() if trial.arrived[k - 1, 0] else None
+        lines.append(json.dumps({"k": k, "u": trial.u[k - 1, 0].tolist(), "y": y, "acks": heard}))
+    out = replay(create(kind, model, lanes=1), model, read_packets(lines, model), use_acks=True)
+    x_hat, P = run(kind, trial)
+    for k, text in enumerate(out):
+        line = json.loads(text)
+        assert (line["x_hat"], line["P"]) == (x_hat[k, 0].tolist(), P[k, 0].tolist())
 
 
 def test_blocks_are_for_applied_inputs() -> None:
