@@ -84,7 +84,7 @@ def merged(trial: Trial, order: int | None) -> Run:
     return by_lane(trial, lane_of)
 
 
-@check(40)
+@check(30)
 @given(trials(chains=CHAINS, steps=(1, 5), lanes=(1, 3)))
 def test_oe_is_the_mixture_over_histories(trial: Trial) -> None:
     trial = holding(trial)
@@ -93,7 +93,7 @@ def test_oe_is_the_mixture_over_histories(trial: Trial) -> None:
     assert_same(run("oe", trial), reference, TOLERANCE)
 
 
-@check(40)
+@check(30)
 @given(trials(chains=CHAINS, steps=(1, 5), lanes=(1, 3)))
 def test_gpb_of_order_k_is_the_mixture_over_histories(trial: Trial) -> None:
     trial = holding(trial)
@@ -161,7 +161,7 @@ def test_linear_filters_at_eight_steps_of_a_plant_that_holds(kind: str, acks: st
     assert_same(run(kind, trial), defined(trial, {"lmmse": lmmse, "ff": ff}[kind], in_time=True), TOLERANCE)
 
 
-@check(30)
+@check(15)
 @given(trials(chains=("bernoulli",), acks=("all",), steps=(1, 8)))
 def test_with_every_ack_it_is_the_kalman_filter_on_what_was_applied(trial: Trial) -> None:
     trial = holding(trial)
@@ -221,7 +221,7 @@ def test_a_split_of_the_lanes_changes_no_bit(kind: str, options: dict[str, int])
             np.testing.assert_array_equal(one[:, 0], all_lanes[:, lane])
 
 
-@pytest.mark.parametrize("kind", ["aoe", "imm", "gpb2", "lmmse", "ff", "kfio"])
+@pytest.mark.parametrize("kind", ["aoe", "gpb2", "lmmse", "ff"])
 def test_compiled_for_many_lanes_it_has_the_same_bits(kind: str) -> None:
     trial = drawn(7, "bernoulli", "all" if kind == "kfio" else "subset", steps=4, lanes=1100, n=1)
     whole, some = run(kind, trial), run(kind, trial.of_lanes(slice(0, 40)))
@@ -246,7 +246,7 @@ def test_what_a_hypothesis_knows_of_the_input_is_exact(trial: Trial) -> None:
             np.testing.assert_allclose(state["x"][n + i, half:], sent, rtol=1e-14)
 
 
-@check(30)
+@check(12)
 @given(trials(chains=CHAINS, acks=("none", "subset"), steps=(8, 14), lanes=(2, 2)))
 def test_p_is_a_covariance_not_below_that_with_every_ack(trial: Trial) -> None:
     trial = holding(trial)
