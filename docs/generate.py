@@ -34,6 +34,7 @@ SCENARIO_TABLES = (
     ("Scenario", "The top of the file", ""),
     ("System", "`[system]`", "x_{k+1} = A x_k + ν_k B u_k + G w_k, y_k = C x_k + v_k."),
     ("Uncertainty", "`[uncertainty]`", "A(ε) = A + Σ ε_k dA_k, and so for G and C."),
+    ("Actuator", "`[actuator]`", "a_k = ν_k u_k, or a_k = ν_k u_k + (1 − ν_k) a_{k−1} with a_{−1} = 0."),
     ("ConstantInput", '`[input]`, `kind = "constant"`', ""),
     ("ExponentialInput", '`[input]`, `kind = "exponential"`', ""),
     ("SineInput", '`[input]`, `kind = "sine"`', ""),
@@ -61,6 +62,7 @@ SCENARIO_TABLES = (
     ("Duplicate", "`duplicate = { … }`", ""),
     ("Corrupt", "`corrupt = { … }`", ""),
     ("EstimatorSpec", "`[[estimators]]`", ""),
+    ("LinkEvent", "`[[events]]`", ""),
     ("Clock", "`[clock]`", ""),
     ("Transport", "`[transport]`", ""),
     ("Tls", "`[transport.tls]`", ""),
@@ -71,6 +73,7 @@ SUMMARY_TABLES = (
     ("BoundFigures", "`bounds`", ""),
     ("LinkFigures", "`links.NAME`", ""),
     ("Transitions", "`links.NAME.transitions`", ""),
+    ("Happened", "`events[…]`", ""),
     ("Check", "`checks[…]`", ""),
     ("Timing", "`timing`", ""),
 )
