@@ -58,7 +58,7 @@ def sample(
     expected = figures["expected_loss_rate"]
     typer.echo(
         f"{link}: {figures['sent']} sent, {figures['dropped']} lost, loss rate {figures['loss_rate']:.6g} "
-        f"(expected {expected:.6g}), mean burst {_shown(figures['mean_burst'])} "
+        f"(expected {'–' if expected is None else f'{expected:.6g}'}), mean burst {_shown(figures['mean_burst'])} "
         f"(expected {_shown(figures['expected_mean_burst'])}); {out}"
     )
 
