@@ -64,7 +64,9 @@ class TcpCarrier:
         elif not self._waiting and self._fits(size):
             self._write(number, size, now_ns)
         elif self._blocks and len(self._waiting) < self._waiting_max:
-            self._waiting.append((number, size, now_ns))
+            if not self._waiting:
+                self._blocked_ns = now_ns
+            self._waiting.append((number, size))
         else:
             self.books.dropped["full"] += 1
 
@@ -105,7 +107,7 @@ class TcpCarrier:
         other = self._receiver.deadline_ns
         if other is not None and (least is None or other < least):
             least = other
-        if self._ends:
+        if self._sender.unacknowledged:
             other = self._progress_ns + self._lease_ns
             if self._waiting:
                 other = min(other, self._blocked_ns + self._blocked_limit_ns)
@@ -192,7 +194,7 @@ class TcpCarrier:
 
     def _write(self, number: int, size: int, now_ns: int) -> None:
         sender = self._sender
-        if not self._ends or sender.unacknowledged == 0:
+        if not sender.unacknowledged:
             self._progress_ns = now_ns
         self._ends.append((sender.written + size, number))
         sender.write(size, now_ns)
@@ -209,7 +211,7 @@ class TcpCarrier:
         waiting = self._waiting
         before = len(waiting)
         while waiting and self._fits(waiting[0][1]):
-            number, size, _ = waiting.popleft()
+            number, size = waiting.popleft()
             self._write(number, size, now_ns)
         if len(waiting) < before:
             self._blocked_ns = now_ns
@@ -224,7 +226,7 @@ class TcpCarrier:
             self._sender.trips.sample(round_trip_ns, 0, 0)
         self._receiver = Receiver(self._delayed_ack_ns, self._acknowledge)
         self._ends: deque[tuple[int, int]] = deque()  # end in the stream, number; not delivered
-        self._waiting: deque[tuple[int, int, int]] = deque()
+        self._waiting: deque[tuple[int, int]] = deque()  # number, size; no room for them yet
         self._progress_ns = self._blocked_ns = 0
 
     def _close(self, now_ns: int) -> None:

@@ -47,7 +47,7 @@ class Receiver:
         self.expected = end
         gap = bool(self._ranges)
         if gap:
-            self._join()
+            duplicate = self._join() or duplicate
         if gap or duplicate is not None or not self._delay_ns:
             self._acknowledge(now_ns, duplicate)
         else:
@@ -86,11 +86,14 @@ class Receiver:
         self._ranges = [(start, end), *kept]
         return duplicate
 
-    def _join(self) -> None:
-        """Ranges that the stream in order has reached become part of it."""
-        while True:
-            reached = [block for block in self._ranges if block[0] <= self.expected]
-            if not reached:
-                return
-            self._ranges = [block for block in self._ranges if block[0] > self.expected]
-            self.expected = max(self.expected, *(high for _, high in reached))
+    def _join(self) -> tuple[int, int] | None:
+        """Ranges that the stream in order has reached become part of it; returns what of the first came twice."""
+        duplicate: tuple[int, int] | None = None
+        for low, high in sorted(self._ranges):
+            if low > self.expected:
+                break
+            if low < self.expected and duplicate is None:
+                duplicate = (low, min(high, self.expected))
+            self.expected = max(self.expected, high)
+        self._ranges = [block for block in self._ranges if block[0] > self.expected]
+        return duplicate

@@ -89,7 +89,7 @@ class Scoreboard:
                     break
             else:
                 continue
-            self._latest(segment, ack.echo, least_ns, now_ns)
+            self._latest(segment, least_ns, now_ns)
             if segment.resent:
                 if segment.lost:
                     segment.lost = segment.resent = False
@@ -142,20 +142,21 @@ class Scoreboard:
                 self.sacked -= 1
             else:
                 news.delivered += 1
-                self._latest(segment, ack.echo, least_ns, now_ns)
+                if not segment.ever or ack.echo >= stamp(segment.sent_ns):
+                    self._latest(segment, least_ns, now_ns)
             if segment.lost:
                 self.lost -= 1
             news.acked += 1
         if reorder is not None and reorder < top:
             self._saw_reordering(reorder, top)
 
-    def _latest(self, segment: Segment, echo: int, least_ns: int | None, now_ns: int) -> None:
+    def _latest(self, segment: Segment, least_ns: int | None, now_ns: int) -> None:
         """RACK's latest delivery (RFC 8985, step 2): of the segments delivered, the one that was sent last."""
         sent_ns = segment.sent_ns
         if sent_ns < self._latest_ns or (sent_ns == self._latest_ns and segment.end <= self._latest_end):
             return
         rtt_ns = now_ns - sent_ns
-        if segment.ever and (least_ns is None or rtt_ns < least_ns or echo < stamp(sent_ns)):
+        if segment.ever and (least_ns is None or rtt_ns < least_ns):
             return  # it may be an earlier transmission that arrived
         self._latest_ns, self._latest_end, self._rtt_ns = sent_ns, segment.end, rtt_ns
         self.advanced = True
