@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from testbed.channel.carrier import MessageBooks
+from testbed.channel.message_books import MessageBooks
 from testbed.channel.pipeline import Pipeline
 from testbed.channel.schedule import Schedule
 from testbed.scenario.carriers import IP_HEADER_BYTES, UDP_HEADER_BYTES, UdpTransport
+from testbed.scenario.links import Impairments
 
 
 class _Message:
@@ -79,6 +80,10 @@ class UdpCarrier:
                 self._drop(message)
         return got
 
+    def change(self, settings: Impairments) -> None:
+        """Other impairments from now on."""
+        self._pipeline.change(settings)
+
     def _arrived(self, message: _Message, place: int) -> bool:
         """An intact fragment; True if the application gets the message now."""
         if not message.missing:
@@ -90,7 +95,7 @@ class UdpCarrier:
         if message.order < self._newest:
             self.books.late += 1
             if self._drop_late:
-                self.books.dropped["late"] += 1
+                self.books.drop("late")
                 return False
         else:
             self._newest = message.order
@@ -98,4 +103,4 @@ class UdpCarrier:
         return True
 
     def _drop(self, message: _Message) -> None:
-        self.books.dropped[message.cause or "corrupt"] += 1
+        self.books.drop(message.cause or "corrupt")

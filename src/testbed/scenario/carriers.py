@@ -75,5 +75,5 @@ class TcpTransport(Part):
         return self
 
 
-Transport = Annotated[UdpTransport | TcpTransport, Field(discriminator="kind")]
+LinkTransport = Annotated[UdpTransport | TcpTransport, Field(discriminator="kind")]
 """The key `transport` of a link's table."""

@@ -6,7 +6,7 @@ import heapq
 from collections import deque
 from typing import Final
 
-from testbed.channel.carrier import MessageBooks
+from testbed.channel.message_books import MessageBooks
 from testbed.channel.pipeline import Pipeline
 from testbed.channel.tcp.congestion import congestion_of
 from testbed.channel.tcp.opening import Opening
@@ -15,6 +15,7 @@ from testbed.channel.tcp.segment import Ack, Data
 from testbed.channel.tcp.sender import Sender
 from testbed.scenario.carriers import TcpTransport
 from testbed.scenario.durations import parse_duration
+from testbed.scenario.links import Impairments
 
 HEADER_BYTES: Final = 52
 """Of IP and TCP, with the time stamps."""
@@ -60,7 +61,7 @@ class TcpCarrier:
         self.books.sent += 1
         size += self._framing
         if self._opening is not None:
-            self.books.dropped["closed"] += 1
+            self.books.drop("closed")
         elif not self._waiting and self._fits(size):
             self._write(number, size, now_ns)
         elif self._blocks and len(self._waiting) < self._waiting_max:
@@ -68,7 +69,7 @@ class TcpCarrier:
                 self._blocked_ns = now_ns
             self._waiting.append((number, size))
         else:
-            self.books.dropped["full"] += 1
+            self.books.drop("full")
 
     def advance(self, to_ns: int) -> list[tuple[int, int]]:
         """(time, number) of the messages that the receiving application got up to ``to_ns``."""
@@ -84,6 +85,11 @@ class TcpCarrier:
         if self._got:
             times.append(self._got[0][0])
         return min(times, default=None)
+
+    def change(self, settings: Impairments) -> None:
+        """Other impairments from now on, in both directions; for one of them, change its pipeline."""
+        for pipeline in self._pipelines[:2]:
+            pipeline.change(settings)
 
     def as_counters(self) -> dict[str, int]:
         """What the connections did so far."""
