@@ -177,3 +177,22 @@ def test_time_outs_are_rare_among_isolated_losses(loss: float) -> None:
     counters = carrier.as_counters()
     assert counters["recoveries"] > 0.5 * loss * 5000
     assert counters["timeouts"] < 0.1 * loss * 5000
+
+
+@pytest.mark.parametrize("congestion", ["cubic", "reno"])
+def test_more_than_a_bottleneck_carries_fills_it_without_time_outs(congestion: str) -> None:
+    delay = {"kind": "constant", "by": "10 ms"}
+    rate = {"bits_per_second": 5e6, "queue_packets": 20}
+    carrier = _carrier(
+        Impairments.model_validate({"delay": delay, "rate": rate}),
+        Impairments.model_validate({"delay": delay}),
+        1,
+        {"congestion": congestion, "framing_bytes": 0},
+    )
+    got: list[tuple[int, int]] = []
+    for number in range(1000):  # 8 Mbit/s
+        carrier.send(number, 10_000, number * 10 * MS)
+        got += carrier.advance(number * 10 * MS)
+    assert 0.95 < len(got) * 80_000 / (10 * 5e6 * 1448 / 1500) < 1.0
+    assert carrier.as_counters()["recoveries"] > 0
+    assert carrier.as_counters()["timeouts"] == 0
