@@ -138,7 +138,7 @@ def test_a_command_that_does_not_fit_is_refused(
                 seen.append(str(refusal.value))
 
     monkeypatch.setattr("testbed.orchestrator.run.Conductor", Refusing)
-    summary = run(scenario(steps=3, estimators=[{"name": "aoe"}]), tmp_path)
+    summary = run(scenario(steps=5, clock={"window": 1}, events=[], estimators=[{"name": "aoe"}]), tmp_path)
     assert seen[0].startswith(problem)
     assert (summary.status, summary.events) == ("complete", ())
 
