@@ -9,10 +9,13 @@ from typing import Annotated, cast, get_args
 
 import typer
 
+from testbed.cli.link_presets import presets
 from testbed.errors import UsageError, did_you_mean
 from testbed.wire.keys import LinkName
 
 app = typer.Typer(help="Look at one link: of a scenario, or of a trace.", rich_markup_mode=None)
+
+app.command()(presets)
 
 _LANE_MAX = 2**31 - 2  # the last lane of the largest scenario
 
