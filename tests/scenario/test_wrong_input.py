@@ -63,7 +63,38 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ({"steps": 0, "seed": -1, "record": 1}, "steps: got 0; allowed: an integer, 1 … 2147483647 (and 2 more)"),
     # later versions
     ({"events": []}, "key 'events' is not supported by this version"),
-    ({"links.ack.delay": "1 ms"}, "links.ack: key 'delay' is not supported by this version"),
+    (
+        {"links.ack.delay": "1 ms"},
+        "links.ack.delay: got '1 ms'; allowed: a table with a kind: constant, uniform, normal, log-normal, table",
+    ),
+    (
+        {"links.control.delay": {"kind": "uniform", "low": "3 ms", "high": "1 ms"}},
+        "links.control.delay.high: got '1 ms'; allowed: not less than low, which is '3 ms'",
+    ),
+    (
+        {"links.control.delay": {"kind": "table", "values": [1.0, -2.0]}},
+        "links.control.delay.values[1]: got -2.0; allowed: 0 or more",
+    ),
+    (
+        {"links.control.delay": {"kind": "normal", "mean": "3 ms", "std": "1 ms", "minimum": "10 ms"}},
+        "links.control.delay.minimum: got '10 ms'; allowed: at most mean + 6 std",
+    ),
+    (
+        {"links.control.clock": "time"},
+        "links.control.slot: got nothing with clock 'time'; allowed: a duration such as '10 ms'",
+    ),
+    (
+        {"links.control.slot": "1 ms"},
+        "links.control.slot: got '1 ms' with clock 'packet'; allowed: only with clock = 'time'",
+    ),
+    (
+        {"links.ack.duplicate": {"chance": 0.5}},
+        "links.ack.duplicate: got a table with mode 'none'; allowed: only with mode 'link'",
+    ),
+    (
+        {"links.control.rate": {"bits_per_second": 0}},
+        "links.control.rate.bits_per_second: got 0; allowed: more than 0, at most 1e+15",
+    ),
     ({"clock.mode": "real"}, "clock.mode: got 'real'; not supported by this version; allowed: virtual"),
     # model error
     (

@@ -161,7 +161,23 @@ class GilbertElliottProcess:
 
     def next(self, number: int) -> Mask:
         """Arrival mask of packet ``number``: a ``bool`` for one lane, else a boolean array of shape (M,)."""
-        good = self._states.next(number)
+        return self.fate(number, self._states.next(number))
+
+    @property
+    def state(self) -> Mask | None:
+        """The state that the last packet met, 1 = good; None before the first."""
+        return self._states.state
+
+    @state.setter
+    def state(self, state: Mask | None) -> None:
+        self._states.state = state
+
+    def move(self, number: int) -> Mask:
+        """State ``number`` where states are not counted by packets."""
+        return self._states.next(number)
+
+    def fate(self, number: int, good: Mask) -> Mask:
+        """The fate of packet ``number`` in that state."""
         bad_arrival, good_arrival = self._arrival
         if isinstance(good, bool):
             (uniform,) = self._drops.uniforms(number)

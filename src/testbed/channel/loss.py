@@ -110,6 +110,23 @@ class LossProcess:
         self._last = uniform < self.chain.arrival_given(self._last)
         return self._last
 
+    @property
+    def state(self) -> Mask | None:
+        """The state that the last packet met; None before the first."""
+        return self._last
+
+    @state.setter
+    def state(self, state: Mask | None) -> None:
+        self._last = state
+
+    def move(self, number: int) -> Mask:
+        """State ``number`` where states are not counted by packets."""
+        return self.next(number)
+
+    def fate(self, number: int, state: Mask) -> Mask:
+        """The fate of packet ``number`` in that state."""
+        return state
+
 
 @dataclass
 class LossCounts:

@@ -168,7 +168,10 @@ def _allowed_plain(plain: Any, field: FieldInfo) -> str:
     metadata = [*field.metadata, *_nested_metadata(field.annotation)]
     low = next((entry.ge for entry in metadata if isinstance(entry, annotated_types.Ge)), None)
     high = next((entry.le for entry in metadata if isinstance(entry, annotated_types.Le)), None)
-    if low is not None and high is None:
+    above = next((entry.gt for entry in metadata if isinstance(entry, annotated_types.Gt)), None)
+    if above is not None:
+        limits = f"more than {above:g}" + ("" if high is None else f", at most {high:g}")
+    elif low is not None and high is None:
         limits = f"{low} or more"
     else:
         limits = f"{low:g} … {high:g}" if plain is float and low is not None else f"{low} … {high}"
@@ -177,7 +180,7 @@ def _allowed_plain(plain: Any, field: FieldInfo) -> str:
     if plain is int:
         return "an integer" if low is None else f"an integer, {limits}"
     if plain is float:
-        return "a finite number" if low is None else limits
+        return "a finite number" if low is None and above is None else limits
     if any(getattr(entry, "pattern", None) == NAME_PATTERN for entry in metadata):
         return NAME_ALLOWED
     most = next((entry.max_length for entry in metadata if isinstance(entry, annotated_types.MaxLen)), None)

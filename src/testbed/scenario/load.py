@@ -60,11 +60,16 @@ def _parse_toml(text: str) -> dict[str, Any]:
 
 
 def _resolve_files(tables: dict[str, Any], base_dir: Path) -> dict[str, Any]:
-    """The tables with the CSV of a table input read in, and paths made absolute. What does not fit is left alone."""
+    """The tables with CSV files read in, and paths made absolute. What does not fit is left alone."""
     result = dict(tables)
     source = result.get("input")
     if isinstance(source, dict) and source.get("kind") == "table":
-        result["input"] = _read_input_table(source, base_dir)
+        result["input"] = _with_values("input", source, base_dir)
+    if isinstance(result.get("links"), dict):
+        result["links"] = {
+            name: _read_delays(name, link, base_dir) if isinstance(link, dict) else link
+            for name, link in result["links"].items()
+        }
     transport = result.get("transport")
     if isinstance(transport, dict):
         transport = _absolute(transport, ("users_file",), base_dir)
@@ -79,17 +84,32 @@ def _absolute(table: dict[str, Any], keys: tuple[str, ...], base_dir: Path) -> d
     return {**table, **{key: str((base_dir / path).absolute()) for key, path in given.items()}}
 
 
-def _read_input_table(source: dict[str, Any], base_dir: Path) -> dict[str, Any]:
+def _read_delays(link: str, table: dict[str, Any], base_dir: Path) -> dict[str, Any]:
+    delay = table.get("delay")
+    if not isinstance(delay, dict) or delay.get("kind") != "table":
+        return table
+    where = f"links.{link}.delay"
+    resolved = _with_values(where, delay, base_dir)
+    rows = resolved["values"]
+    if resolved is not delay:
+        if len(rows[0]) != 1:
+            raise UsageError(f"{where}.file: {delay['file']}: got {len(rows[0])} numbers a row; allowed: one")
+        resolved["values"] = [row[0] for row in rows]
+    return {**table, "delay": resolved}
+
+
+def _with_values(where: str, source: dict[str, Any], base_dir: Path) -> dict[str, Any]:
+    """The table with the rows of its ``file`` as its ``values``."""
     if ("file" in source) == ("values" in source):
         given = "both" if "file" in source else "neither"
-        raise UsageError(f"input: got {given} of file and values; allowed: exactly one of file, values")
+        raise UsageError(f"{where}: got {given} of file and values; allowed: exactly one of file, values")
     if "file" not in source:
         return source
     file = source["file"]
     if not isinstance(file, str) or not file:
-        raise UsageError(f"input.file: got {shown(file)}; allowed: the path of a CSV file")
+        raise UsageError(f"{where}.file: got {shown(file)}; allowed: the path of a CSV file")
     try:
         values = read_table(base_dir / file)
     except UsageError as error:
-        raise UsageError(f"input.file: {file}: {error}") from None
+        raise UsageError(f"{where}.file: {file}: {error}") from None
     return {**{key: value for key, value in source.items() if key != "file"}, "values": values}
