@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -19,13 +20,14 @@ from testbed.scenario import Scenario
 from testbed.wire.keys import LinkName
 
 HEADER = ("seq", "sent_ns", "delivered_ns")
+Row = tuple[int, int, int | None]
 
 
 @dataclass(frozen=True)
 class Trace:
     """Packets in the order of delivery, lost ones where they were sent: (seq, sent_ns, delivered_ns or None)."""
 
-    rows: list[tuple[int, int, int | None]]
+    rows: list[Row]
     counts: LossCounts
     losses: LossModel
 
@@ -55,12 +57,12 @@ def sample_trace(scenario: Scenario, link: LinkName, number: int, *, seed: int, 
     return Trace(rows, counts, losses_of(scenario, link))
 
 
-def write_trace(path: Path, trace: Trace) -> None:
+def write_trace(path: Path, rows: Iterable[Row]) -> None:
     """Write TRACE.csv. Raises OSError."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(HEADER)
-        writer.writerows(("" if field is None else field for field in row) for row in trace.rows)
+        writer.writerows(("" if field is None else field for field in row) for row in rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,44 +78,51 @@ def read_fates(path: Path) -> Fates:
 
     Raises UsageError where it is no such file, or where a packet between the first and the last has no row.
     """
+    arrived: dict[int, bool] = {}
+    rows = read_rows(path)
+    for seq, _, delivered in rows:
+        arrived[seq] = arrived.get(seq, False) or delivered is not None
+    return Fates(np.array([arrived[seq] for seq in sorted(arrived)], dtype=np.bool_), len(rows) - len(arrived))
+
+
+def read_rows(path: Path) -> list[Row]:
+    """The rows of a TRACE.csv in their order. Raises UsageError as ``read_fates`` does."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            return _fates(path, csv.reader(file, strict=True))
+            rows = list(_rows(path, csv.reader(file, strict=True)))
     except OSError as error:
         raise UsageError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from None
     except (UnicodeDecodeError, csv.Error):
         raise UsageError(f"{path}: not a trace; {_ALLOWED}") from None
-
-
-_DIGITS_MAX = 20  # of 64 bits
-_ALLOWED = f"allowed: CSV in UTF-8 with the header {','.join(HEADER)}"
-
-
-def _fates(path: Path, rows: Any) -> Fates:
-    header = next(rows, None)
-    if header is None or tuple(name.strip() for name in header) != HEADER:
-        got = "an empty file" if header is None else f"the header {','.join(header)[:60]!r}"
-        raise UsageError(f"{path}: not a trace: got {got}; {_ALLOWED}")
-    arrived: dict[int, bool] = {}
-    read = 0
-    for row in rows:
-        if not row:
-            continue
-        where = f"{path}:{rows.line_num}"
-        if len(row) != len(HEADER):
-            raise UsageError(f"{where}: got {len(row)} field{'s' * (len(row) != 1)}; allowed: {len(HEADER)}")
-        seq, _, delivered = (_whole(where, name, text.strip()) for name, text in zip(HEADER, row, strict=True))
-        assert seq is not None
-        arrived[seq] = arrived.get(seq, False) or delivered is not None
-        read += 1
-    order = sorted(arrived)
+    order = sorted({seq for seq, _, _ in rows})
     for before, after in pairwise(order):
         if after != before + 1:
             raise UsageError(
                 f"{path}: no row for packet {before + 1}; allowed: a row for each from {order[0]} to {order[-1]}, "
                 "with delivered_ns empty where it was lost"
             )
-    return Fates(np.array([arrived[seq] for seq in order], dtype=np.bool_), read - len(order))
+    return rows
+
+
+_DIGITS_MAX = 20  # of 64 bits
+_ALLOWED = f"allowed: CSV in UTF-8 with the header {','.join(HEADER)}"
+
+
+def _rows(path: Path, rows: Any) -> Iterator[Row]:
+    header = next(rows, None)
+    if header is None or tuple(name.strip() for name in header) != HEADER:
+        got = "an empty file" if header is None else f"the header {','.join(header)[:60]!r}"
+        raise UsageError(f"{path}: not a trace: got {got}; {_ALLOWED}")
+    for row in rows:
+        if not row:
+            continue
+        where = f"{path}:{rows.line_num}"
+        if len(row) != len(HEADER):
+            raise UsageError(f"{where}: got {len(row)} field{'s' * (len(row) != 1)}; allowed: {len(HEADER)}")
+        seq, sent, delivered = (_whole(where, name, text.strip()) for name, text in zip(HEADER, row, strict=True))
+        assert seq is not None
+        assert sent is not None
+        yield seq, sent, delivered
 
 
 def _whole(where: str, name: str, text: str) -> int | None:

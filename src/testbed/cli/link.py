@@ -9,12 +9,14 @@ from typing import Annotated, cast, get_args
 
 import typer
 
+from testbed.cli.link_import import import_
 from testbed.cli.link_presets import presets
 from testbed.errors import UsageError, did_you_mean
 from testbed.wire.keys import LinkName
 
 app = typer.Typer(help="Look at one link: of a scenario, or of a trace.", rich_markup_mode=None)
 
+app.command("import")(import_)
 app.command()(presets)
 
 _LANE_MAX = 2**31 - 2  # the last lane of the largest scenario
@@ -51,7 +53,7 @@ def sample(
         raise UsageError('--link ack: the scenario has none; allowed: with [links.ack] mode = "perfect" or "link"')
     trace = sample_trace(loaded, link, number, seed=loaded.seed if seed is None else seed, lane=lane)
     try:
-        write_trace(out, trace)
+        write_trace(out, trace.rows)
     except OSError as error:
         raise UsageError(f"cannot write {out}: {(error.strerror or str(error)).lower()}") from None
     figures = trace.figures()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from ipaddress import IPv4Address, IPv6Address
+from ipaddress import AddressValueError, IPv4Address, IPv6Address
 
 from testbed.channel.capture.frames import Frame
 
@@ -60,7 +60,7 @@ def datagram_of(frame: Frame) -> Datagram | str:
         if version == 4:
             return _ip4(frame.at_ns, packet)
         return _ip6(frame.at_ns, packet) if version == 6 else "not IP"
-    except (struct.error, IndexError):
+    except (struct.error, IndexError, AddressValueError):
         return "cut short"
 
 

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.channel.trace import Row
 from testbed.errors import UsageError
 
-Row = tuple[int, int, int | None]
-"""seq, sent_ns, delivered_ns or None."""
 PACKETS_MAX = 20_000_000
 
 

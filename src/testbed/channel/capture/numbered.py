@@ -154,6 +154,8 @@ def _numbered(read: Read, numbering: Numbering, where: str, near: int | None = N
         times[unwrapped.next(number)].append(packet.at_ns)
     if not times:
         raise UsageError(f"{where}: got no packet with a number at that place; allowed: one or more")
+    if len(times) == 1 < len(next(iter(times.values()))):
+        raise UsageError(f"{where}: got the number {next(iter(times))} in every packet; allowed: one that counts them")
     if max(times) - min(times) >= PACKETS_MAX:
         raise UsageError(f"{where}: got numbers {min(times)} … {max(times)}; allowed: fewer than {PACKETS_MAX} apart")
     return dict(times)

@@ -22,9 +22,13 @@ _WINDOWS_REPLY = re.compile(rf"^Reply from \S+: (?:bytes=\d+ )?time[=<]{_NUMBER}
 _LOST = re.compile(r"^(?:no answer yet for|Request timeout for) icmp_seq[=\s](\d{1,9})", re.ASCII)
 _UNREACHABLE = re.compile(r"^From .*\bicmp_seq=(\d{1,9})\b", re.ASCII)
 _WINDOWS_LOST = re.compile(
-    r"^(?:Request timed out|Reply from \S+: .*(?:unreachable|expired)|General failure|PING: )", re.I
+    r"^(?:Request timed out|Reply from \S+: .*(?:unreachable|expired)|General failure|PING: transmit failed)", re.ASCII
 )
 _TRANSMITTED = re.compile(r"^(\d{1,9}) packets transmitted, (?:\d+) (packets )?received", re.ASCII)
+_HEADINGS = (
+    *("PING ", "--- ", "rtt ", "round-trip "),
+    *("Pinging ", "Ping statistics", "Packets: ", "Approximate round trip", "Minimum = "),
+)
 _BITS = 16
 
 
@@ -84,8 +88,8 @@ def _take(line: str, log: _Log, unwrapped: Unwrapped) -> None:
         log.next_line += 1
     elif found := _TRANSMITTED.match(line):
         log.transmitted, log.first = int(found[1]), 0 if found[2] else 1
-    elif not line.startswith(("PING ", "Pinging ", "--- ", "rtt ", "round-trip ", "Ping statistics", "Packets: ")):
-        log.left_out["lines of something else"] += 1
+    elif not line.startswith(_HEADINGS):
+        log.left_out["not of ping"] += 1
 
 
 def _sent(log: _Log, first: int, last: int, interval_ns: int | None) -> tuple[list[int], bool]:
