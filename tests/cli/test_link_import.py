@@ -45,7 +45,7 @@ def test_two_captures_with_all_options(testbed: Command, tmp_path: Path) -> None
     lost = {7, 14, 21}
     arrived = [Taken(frame.at_ns + 5, frame.data) for k, frame in enumerate(frames) if k not in lost]
     (tmp_path / "r.pcap").write_bytes(build.pcap(arrived))
-    chosen = ("--protocol", "udp", "--port", 5000, "--from", "10.0.0.1", "--to", "10.0.0.2", "--format", "capture")
+    chosen = ("--from", "10.0.0.1", "--to", "10.0.0.2", "--from-port", 4000, "--to-port", 5000, "--protocol", "udp")
     for more in ((), ("--rtp",), ("--sequence", "2:2"), ("--match", "payload")):
         given = testbed("link", "import", "s.pcap", "--receiver", "r.pcap", "--out", "t.csv", *chosen, *more)
         assert (given.code, given.err) == (0, "")
@@ -61,7 +61,7 @@ def test_two_captures_with_all_options(testbed: Command, tmp_path: Path) -> None
         (("ping.log", "--format", "pcap"), "testbed: --format: got 'pcap'; allowed: auto, capture, ping"),
         (("ping.log", "--format", "capture"), "testbed: ping.log: got a file that begins with 36342062"),
         (("ping.log", "--protocol", "upd"), "testbed: --protocol: got 'upd'; allowed: icmp, tcp, udp; did you mean"),
-        (("ping.log", "--port", 80), "testbed: ping.log: got a log of ping; allowed with it: --interval"),
+        (("ping.log", "--to-port", 80), "testbed: ping.log: got a log of ping; allowed with it: --interval"),
         (("ping.log", "--interval", "20"), "testbed: --interval: got '20'; allowed: a duration with a unit"),
         (("ping.log", "--rtp", "--sequence", "0:4"), "testbed: --rtp, --sequence: got both; allowed: one of them"),
         (("ping.log", "--match", "x"), "testbed: --match: got 'x'; allowed: packet, payload"),

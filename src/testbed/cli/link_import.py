@@ -20,9 +20,10 @@ def import_(
     ] = None,
     format: Annotated[str, typer.Option(metavar="FORMAT", help="auto, capture or ping.")] = "auto",
     protocol: Annotated[str | None, typer.Option(metavar="NAME", help="Only udp, tcp or icmp.")] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Only packets from or to this port.")] = None,
     source: Annotated[str | None, typer.Option("--from", metavar="ADDRESS", help="Only packets from there.")] = None,
     to: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Only packets to there.")] = None,
+    from_port: Annotated[int | None, typer.Option(min=0, max=65535, help="Only packets from this port.")] = None,
+    to_port: Annotated[int | None, typer.Option(min=0, max=65535, help="Only packets to this port.")] = None,
     rtp: Annotated[bool, typer.Option("--rtp", help="The packets are RTP: use its sequence numbers.")] = False,
     sequence: Annotated[
         str | None,
@@ -58,9 +59,10 @@ def import_(
         receiver=receiver,
         wanted=Filter(
             None if protocol is None else _one_of("--protocol", protocol, sorted({*PROTOCOLS.values()})),
-            port,
             source,
             to,
+            from_port,
+            to_port,
         ),
         numbering=RTP if rtp else Numbering.parse(sequence) if sequence is not None else None,
         match=cast(Match, _one_of("--match", match, get_args(Match))),

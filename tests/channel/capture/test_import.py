@@ -181,7 +181,7 @@ def test_filters_and_what_they_leave_out(tmp_path: Path) -> None:
         UsageError, match=r"s\.pcap: got 2 flows: udp 10\.0\.0\.1 port 4000 → 10\.0\.0\.2 port 5000 \(60\)"
     ):
         import_trace(sender, Wish(receiver=receiver))
-    for wanted in (Filter(port=5000), Filter("udp", 4000, "10.0.0.1", "10.0.0.2")):
+    for wanted in (Filter(destination_port=5000), Filter("udp", "10.0.0.1", "10.0.0.2", 4000)):
         imported = import_trace(sender, Wish(receiver=receiver, wanted=wanted))
         check(imported, made)
         assert imported.left_out == {

@@ -17,12 +17,13 @@ _FLOWS_SHOWN = 4
 
 @dataclass(frozen=True)
 class Filter:
-    """Which datagrams: those with all that is given, and replies to such echo requests. port: of either end."""
+    """Which datagrams: those with all that is given, and replies to such echo requests."""
 
     protocol: str | None = None
-    port: int | None = None
     source: str | None = None
     destination: str | None = None
+    source_port: int | None = None
+    destination_port: int | None = None
 
     def __post_init__(self) -> None:
         for option, text in (("--from", self.source), ("--to", self.destination)):
@@ -37,7 +38,8 @@ class Filter:
         source, destination = reversed(ends) if packet.echo == "reply" else ends
         return (
             self.protocol in (None, packet.protocol)
-            and (self.port is None or self.port in packet.ports)
+            and self.source_port in (None, packet.ports[0])
+            and self.destination_port in (None, packet.ports[1])
             and (self.source is None or ip_address(self.source) == ip_address(source))
             and (self.destination is None or ip_address(self.destination) == ip_address(destination))
         )
@@ -62,7 +64,7 @@ class Read:
             more = "; …" if len(flows) > _FLOWS_SHOWN else ""
             raise UsageError(
                 f"{self.path}: got {len(flows)} flows: {names}{more}; allowed: one; "
-                "choose it with --protocol, --port, --from, --to"
+                "choose it with --protocol, --from, --to, --from-port, --to-port"
             )
 
 
