@@ -16,13 +16,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from testbed.channel.pipeline import Pipeline
 from testbed.channel.service import loss_process
 from testbed.scenario import parse_scenario
 
 Bits = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
-LANES, STEPS = 1000, 1000
+SYSTEM = {"A": [[1.0]], "C": [[1.0]], "Q": [[1.0]], "R": [[1.0]]}
+SEED, LANES, STEPS = 7, 1000, 1000
 LEVEL = 1e-6
 EXPECTED_MIN = 100.0
 CELLS_MAX = 14
@@ -73,8 +75,8 @@ MODELS = {
 
 def fates(loss: dict[str, Any], *, lanes: int = LANES, steps: int = STEPS) -> Bits:
     """Arrival bits (steps, lanes) of a link of a scenario, as in a run."""
-    system = {"A": [[1.0]], "C": [[1.0]], "Q": [[1.0]], "R": [[1.0]]}
-    scenario = parse_scenario({"seed": 7, "lanes": lanes, "system": system, "links": {"observation": {"loss": loss}}})
+    links = {"observation": {"loss": loss}}
+    scenario = parse_scenario({"seed": SEED, "lanes": lanes, "system": SYSTEM, "links": links})
     process = loss_process(scenario, "observation", 0, lanes)
     return np.array([process.next(number) for number in range(steps)])
 
@@ -149,3 +151,14 @@ def test_a_wrong_model_is_seen(name: str) -> None:
         off[state, state] += 0.2
         wrong = Model(model.loss, off.tolist(), model.lost)
         assert min(transitions_p_value(wrong, bits), runs_p_value(wrong, bits, False)) < LEVEL
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_pipeline_loses_the_same_packets(name: str) -> None:
+    """One lane by itself, packet by packet, as over real sockets: what is shown above holds for it too."""
+    loss = MODELS[name].loss
+    bits = fates(loss, lanes=20, steps=300)
+    links = parse_scenario({"system": SYSTEM, "links": {"observation": {"loss": loss}}}).links
+    for lane in (0, 7, 19):
+        pipeline = Pipeline(links.observation, SEED, "link.observation", lane)
+        assert [bool(pipeline.send(64, k)) for k in range(300)] == bits[:, lane].tolist()

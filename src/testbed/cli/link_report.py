@@ -74,7 +74,7 @@ def _show(name: str, figures: TraceFigures, notes: list[str]) -> None:
     from rich.console import Console
 
     console = Console(highlight=False, markup=False)
-    copies = f", {figures.copies} copies" if figures.copies else ""
+    copies = f", {figures.copies} {'copy' if figures.copies == 1 else 'copies'}" if figures.copies else ""
     console.print(f"{name}: {figures.packets} packets, {figures.lost} lost{copies}\n", soft_wrap=True)
     parts = [_losses(figures), _delays(figures.delays) if figures.delays else f"no delays: {figures.why_no_delays}"]
     for part in (*parts, _order(figures)):
