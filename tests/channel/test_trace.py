@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from testbed.channel.service import loss_process
-from testbed.channel.trace import read_fates, sample_trace, write_trace
+from testbed.channel.trace import sample_trace, write_trace
 from testbed.errors import UsageError
 from testbed.scenario import Scenario, parse_scenario
+from testbed.scenario.trace_file import read_fates
 
 
 def scenario(loss: dict[str, Any], **rest: Any) -> Scenario:
@@ -25,7 +26,7 @@ MARKOV = {"kind": "markov", "recovery": 0.4, "failure": 0.2}
 
 def test_rows_are_a_packet_a_period(tmp_path: Path) -> None:
     trace = sample_trace(scenario(MARKOV, clock={"period": "2 ms"}), "observation", 500, seed=3)
-    write_trace(tmp_path / "trace.csv", trace.rows)
+    write_trace(tmp_path / "trace.csv", trace)
     with (tmp_path / "trace.csv").open(newline="") as file:
         header, *rows = list(csv.reader(file))
     assert header == ["seq", "sent_ns", "delivered_ns"]
@@ -97,7 +98,7 @@ def test_a_perfect_ack_link_loses_nothing() -> None:
 
 def test_what_was_written_is_read(tmp_path: Path) -> None:
     trace = sample_trace(scenario(MARKOV), "observation", 300, seed=2)
-    write_trace(tmp_path / "trace.csv", trace.rows)
+    write_trace(tmp_path / "trace.csv", trace)
     fates = read_fates(tmp_path / "trace.csv")
     assert fates.arrived.tolist() == [delivered is not None for _, _, delivered in trace.rows]
     assert fates.duplicates == 0

@@ -10,8 +10,8 @@ import pytest
 from channel.capture import build
 from channel.capture.build import MS, Taken
 from cli.commands import Command, testbed
-from testbed.channel.trace import read_rows
 from testbed.scenario.presets import presets
+from testbed.scenario.trace_file import read_rows
 
 __all__ = ["testbed"]
 

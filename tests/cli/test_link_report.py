@@ -13,8 +13,8 @@ import pytest
 from cli.commands import Command, testbed, write
 from testbed.channel.capture.imported import rows_of
 from testbed.channel.pipeline import Pipeline
-from testbed.channel.trace import write_trace
 from testbed.scenario import load_scenario
+from testbed.scenario.trace_file import write_rows
 
 __all__ = ["testbed"]
 
@@ -33,7 +33,7 @@ def sampled(folder: Path, link: dict[str, Any], packets: int = 4000) -> dict[str
     scenario = load_scenario(write(folder / "s.toml", links={"observation": link}))
     pipeline = Pipeline(scenario.links.observation, 3, "link.observation")
     arrivals = [[copy.at_ns for copy in pipeline.send(64, k * 10 * MS)] for k in range(packets)]
-    write_trace(folder / "t.csv", rows_of([k * 10 * MS for k in range(packets)], arrivals))
+    write_rows(folder / "t.csv", rows_of([k * 10 * MS for k in range(packets)], arrivals))
     return pipeline.books.as_counters()
 
 

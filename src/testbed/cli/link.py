@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from testbed.cli.link_import import import_
-from testbed.cli.link_names import link_of
+from testbed.cli.link_names import link_name
 from testbed.cli.link_presets import presets
 from testbed.cli.link_report import report
 from testbed.errors import UsageError
@@ -48,14 +48,14 @@ def sample(
     from testbed.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    link = link_of(name)
+    link = link_name(name)
     if lane > _LANE_MAX:
         raise UsageError(f"--lane {lane}: allowed: 0 … {_LANE_MAX}")
     if link == "ack" and loaded.links.ack.mode == "none":
         raise UsageError('--link ack: the scenario has none; allowed: with [links.ack] mode = "perfect" or "link"')
     trace = sample_trace(loaded, link, number, seed=loaded.seed if seed is None else seed, lane=lane)
     try:
-        write_trace(out, trace.rows)
+        write_trace(out, trace)
     except OSError as error:
         raise UsageError(f"cannot write {out}: {(error.strerror or str(error)).lower()}") from None
     figures = trace.figures()
@@ -81,7 +81,7 @@ def fit(
     scenario. A packet with several rows is one packet, which arrived if one of them has delivered_ns.
     """
     from testbed.analysis.fit import fit_losses
-    from testbed.channel.trace import read_fates
+    from testbed.scenario.trace_file import read_fates
 
     fates = read_fates(trace)
     try:

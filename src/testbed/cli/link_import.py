@@ -50,7 +50,7 @@ def import_(
     from testbed.channel.capture.numbered import RTP, Numbering
     from testbed.channel.capture.pairing import Match
     from testbed.channel.capture.read import Format, Wish, import_trace
-    from testbed.channel.trace import write_trace
+    from testbed.scenario.trace_file import write_rows
 
     if rtp and sequence is not None:
         raise UsageError("--rtp, --sequence: got both; allowed: one of them")
@@ -70,7 +70,7 @@ def import_(
     )
     imported = import_trace(file, wish)
     try:
-        write_trace(out, imported.rows)
+        write_rows(out, imported.rows)
     except OSError as error:
         raise UsageError(f"cannot write {out}: {(error.strerror or str(error)).lower()}") from None
     figures = imported.figures()

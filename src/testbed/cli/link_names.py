@@ -1,4 +1,4 @@
-"""The names of the links of a scenario on the command line."""
+"""Names of links as options give them."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from testbed.errors import UsageError, did_you_mean
 from testbed.wire.keys import LinkName
 
 
-def link_of(name: str) -> LinkName:
-    """The link of this name. Raises UsageError."""
+def link_name(name: str, option: str = "--link") -> LinkName:
+    """Raises UsageError for an unknown one."""
     names = get_args(LinkName)
     if name not in names:
-        raise UsageError(f"--link {name}: no such link; allowed: {', '.join(names)}{did_you_mean(name, names)}")
+        raise UsageError(f"{option} {name}: no such link; allowed: {', '.join(names)}{did_you_mean(name, names)}")
     return cast(LinkName, name)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from testbed.cli.link_names import link_of
+from testbed.cli.link_names import link_name
 from testbed.cli.tables import row, table
 from testbed.errors import UsageError
 
@@ -40,10 +40,10 @@ def report(
     are at 95 % and allow for the correlation of what they are of.
     """
     from testbed.analysis.trace_figures import Packets, trace_figures
-    from testbed.channel.trace import read_rows
     from testbed.orchestrator.trace_report import write_trace_report
     from testbed.orchestrator.trace_report.compare import fitted_model, model_of_link
     from testbed.scenario import load_scenario
+    from testbed.scenario.trace_file import read_rows
 
     if (scenario is None) != (name is None):
         raise UsageError("--scenario, --link: got one of them; allowed: both, or neither")
@@ -53,7 +53,7 @@ def report(
         if scenario is None or name is None:
             model, notes = fitted_model(packets)
         else:
-            model, notes = model_of_link(load_scenario(scenario), link_of(name))
+            model, notes = model_of_link(load_scenario(scenario), link_name(name))
         figures = trace_figures(packets, model)
     except UsageError as error:
         raise error if scenario is not None else UsageError(f"{trace}: {error}") from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from ipaddress import AddressValueError, IPv4Address, IPv6Address
 
 from testbed.channel.capture.frames import Frame
@@ -105,6 +106,16 @@ _LINKS: dict[int, Callable[[bytes], bytes]] = {
 Linux cooked, IPv4, IPv6, Linux cooked 2."""
 
 
+@lru_cache(4096)
+def _address4(packed: bytes) -> str:
+    return str(IPv4Address(packed))
+
+
+@lru_cache(4096)
+def _address6(packed: bytes) -> str:
+    return str(IPv6Address(packed))
+
+
 def _ip4(at_ns: int, packet: bytes) -> Datagram | str:
     length, identification, fragment, protocol = struct.unpack_from(">2xHHHxB", packet)
     header = 4 * (packet[0] & 15)
@@ -112,7 +123,7 @@ def _ip4(at_ns: int, packet: bytes) -> Datagram | str:
         return "cut short"
     if fragment & 0x3FFF:
         return "fragments"
-    source, destination = (str(IPv4Address(packet[at : at + 4])) for at in (12, 16))
+    source, destination = _address4(packet[12:16]), _address4(packet[16:20])
     body = packet[header : length or None]  # a length of 0: segments joined by the network card
     whole = not length or len(packet) >= length
     return _body(at_ns, source, destination, protocol, identification, body, whole)
@@ -120,7 +131,7 @@ def _ip4(at_ns: int, packet: bytes) -> Datagram | str:
 
 def _ip6(at_ns: int, packet: bytes) -> Datagram | str:
     length, following = struct.unpack_from(">4xHB", packet)
-    source, destination = (str(IPv6Address(packet[at : at + 16])) for at in (8, 24))
+    source, destination = _address6(packet[8:24]), _address6(packet[24:40])
     whole = not length or len(packet) >= 40 + length
     body = packet[40 : 40 + length if length else None]
     for _ in range(_EXTENSIONS_MAX):

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from testbed.channel.trace import Row
 from testbed.errors import UsageError
+from testbed.scenario.trace_file import Row
 
 PACKETS_MAX = 20_000_000
 
