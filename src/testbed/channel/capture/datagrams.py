@@ -149,25 +149,26 @@ def _body(
     if protocol not in PROTOCOLS:
         return "not UDP, TCP or ICMP echo"
     echo, sequence = "", 0
+    first, second = struct.unpack_from(">HH", body)
     if protocol == _UDP:
-        ports, payload = struct.unpack_from(">HH", body), body[8:]
         if len(body) < 8:
             return "cut short"
+        payload = body[8:]
     elif protocol == _TCP:
-        *ports_, sequence = struct.unpack_from(">HHI", body)
-        ports, payload = (ports_[0], ports_[1]), body[4 * (body[12] >> 4) :]
+        (sequence,) = struct.unpack_from(">4xI", body)
+        payload = body[4 * (body[12] >> 4) :]
     else:
-        kind, identifier, sequence = struct.unpack_from(">B3xHH", body)
-        echo = _ECHO.get((protocol, kind), "")
+        echo = _ECHO.get((protocol, body[0]), "")
         if not echo:
             return "not UDP, TCP or ICMP echo"
-        ports, payload = (identifier, identifier), body[8:]
+        first, sequence = struct.unpack_from(">4xHH", body)
+        second, payload = first, body[8:]
     return Datagram(
         at_ns,
         source,
         destination,
         PROTOCOLS[protocol],
-        (ports[0], ports[1]),
+        (first, second),
         echo,
         sequence,
         identification,
