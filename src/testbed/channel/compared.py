@@ -11,6 +11,8 @@ from testbed.scenario import Scenario
 from testbed.scenario.impairments import ConstantDelay
 from testbed.wire.keys import LinkName
 
+_REPLAYED = ("trace", "scripted")
+
 
 @dataclass(frozen=True)
 class Comparable:
@@ -26,7 +28,10 @@ def comparable(scenario: Scenario, link: LinkName) -> Comparable:
     settings = getattr(scenario.links, link)
     notes = []
     losses: LossModel | None = chain_of(settings.loss)
-    if settings.clock == "time":
+    if settings.loss.kind in _REPLAYED:
+        losses = None
+        notes.append("the losses are replayed: there is no law to compare with")
+    elif settings.clock == "time":
         losses = None
         notes.append("the chain of the losses moves by time: by packet it has no law to compare with")
     elif settings.rate is not None and (settings.rate.queue_packets or settings.rate.queue_bytes):

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from testbed.channel.chains import chain_of
-from testbed.channel.gilbert_elliott import GilbertElliott, GilbertElliottProcess
-from testbed.channel.law import LossModel
-from testbed.channel.loss import LossCounts, LossProcess
+from testbed.channel.loss import LossCounts
+from testbed.channel.processes import FateProcess, process_of
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
-from testbed.scenario import Link, NoLoss, Scenario
+from testbed.scenario import Link, Loss, NoLoss, Scenario
 from testbed.wire.keys import LinkName
 from testbed.wire.messages import Acknowledgement, Control, Observation, Packet
 from testbed.wire.node import Node
@@ -37,25 +35,20 @@ def builder(link: LinkName) -> Any:
     return partial(LinkService, link=link)
 
 
-def losses_of(scenario: Scenario, link: LinkName) -> LossModel:
-    """The loss model of a link; that of an ACK link that is none or perfect loses nothing."""
+def loss_of(scenario: Scenario, link: LinkName) -> Loss:
+    """The loss of a link; that of an ACK link that is none or perfect loses nothing."""
     settings = getattr(scenario.links, link)
-    return chain_of(settings.loss if isinstance(settings, Link) or settings.mode == "link" else NoLoss())
+    loss: Loss = settings.loss if isinstance(settings, Link) or settings.mode == "link" else NoLoss()
+    return loss
 
 
-def loss_process(scenario: Scenario, link: LinkName, lane: int, lanes: int) -> LossProcess | GilbertElliottProcess:
-    """The loss process of a block of lanes of a link; the same draws wherever it runs.
-
-    The hidden states have a stream of their own: the draws that decide over the packets are the same for every loss.
-    """
+def loss_process(scenario: Scenario, link: LinkName, lane: int, lanes: int) -> FateProcess:
+    """The loss process of a block of lanes of a link; the same draws wherever it runs."""
 
     def stream(purpose: str) -> Stream:
         return Stream(scenario.seed, role_of(link), purpose, width=1, lane=lane, lanes=lanes)
 
-    losses = losses_of(scenario, link)
-    if isinstance(losses, GilbertElliott):
-        return GilbertElliottProcess(losses, stream("state"), stream("loss"), lanes)
-    return LossProcess(losses, stream("loss"), lanes)
+    return process_of(loss_of(scenario, link), stream, lanes)
 
 
 class LinkService:

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from testbed.channel.chains import chain_of
 from testbed.channel.law import LossModel
 from testbed.channel.loss import LossCounts
-from testbed.channel.service import loss_process, losses_of
+from testbed.channel.service import loss_of, loss_process
 from testbed.scenario import Scenario
 from testbed.scenario.trace_file import Row, write_rows
 from testbed.wire.keys import LinkName
@@ -45,7 +46,7 @@ def sample_trace(scenario: Scenario, link: LinkName, number: int, *, seed: int, 
         arrived = process.next(seq)
         counts.count(lane, arrived)
         rows.append((seq, seq * period_ns, seq * period_ns if arrived else None))
-    return Trace(rows, counts, losses_of(scenario, link))
+    return Trace(rows, counts, chain_of(loss_of(scenario, link)))
 
 
 def write_trace(path: Path, trace: Trace) -> None:

@@ -6,7 +6,8 @@ P_0 = 0, a chain that never moves from its start ½ and no observation, P_2 = 5 
 Cov(ν_i, ν_j) ≤ ¼ |r|^|i−j| with r = 1 − recovery − failure, and by Gershgorin's theorem, ¼U (1 + |r|)/(1 − |r|) a step
 is enough for the best estimator; that is the *correlated* upper bound here. For Gilbert–Elliott losses Cov(ν_i, ν_j) =
 δ² r^|i−j| Var(s_i), i < j, with s_i = 1 in the good state, r the memory of the states, and δ the difference of their
-arrival probabilities: ¼U (1 + 2 δ² |r|/(1 − |r|)) is enough.
+arrival probabilities: ¼U (1 + 2 δ² |r|/(1 − |r|)) is enough. In general the factor of ¼U is the ``covariance_factor``
+of the losses.
 """
 
 from __future__ import annotations
@@ -16,21 +17,11 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from testbed.channel.gilbert_elliott import GilbertElliott
-from testbed.channel.law import LossModel
 from testbed.estimator.model import Model
 from testbed.estimator.riccati import Gain, phi, predict
 from testbed.numerics.lanes import Constant, Floats, Mask, Matrix, constant, mask_of, matrices_of
 from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
-
-
-def correlation_factor(control: LossModel) -> float | None:
-    """(1 + |r|)/(1 − |r|) of the control losses: 1 for i.i.d. ones, None where it is infinite."""
-    r = 0.0 if control.independent or control.never_loses else abs(control.memory)
-    if isinstance(control, GilbertElliott):
-        return 1.0 + 2.0 * control.contrast**2 * r / (1.0 - r) if r < 1.0 else None
-    return (1.0 + r) / (1.0 - r) if r < 1.0 else None
 
 
 class CovarianceBound:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.errors import RunFailed
-from testbed.estimator.bounds import Bounds, correlation_factor, upper_bound
+from testbed.estimator.bounds import Bounds, upper_bound
 from testbed.estimator.registry import model_of
 from testbed.numerics.lanes import Component, trace
 from testbed.plant.inputs import control_bound
@@ -25,7 +25,7 @@ class BoundsService:
 
     def __init__(self, node: Node, setup: Setup) -> None:
         model, bound = model_of(setup.scenario), control_bound(setup.scenario)
-        factor = correlation_factor(model.control)
+        factor = model.control.covariance_factor
         self._blocks = {lane: Bounds(model, bound, lanes) for lane, lanes in setup.blocks}
         self._correlated = {
             lane: upper_bound(model, factor * bound, lanes)

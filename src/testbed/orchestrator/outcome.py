@@ -12,8 +12,7 @@ from testbed import __version__
 from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.channel.chains import chain_of
-from testbed.channel.gilbert_elliott import GilbertElliott
-from testbed.estimator.bounds import correlation_factor
+from testbed.channel.hidden import Hidden
 from testbed.estimator.service import acks_of, role_of
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import (
@@ -87,7 +86,7 @@ def moment_checks(scenario: Scenario) -> list[Check]:
     """Whether the EEC and the variance of its sample mean can be finite."""
     A, losses = np.array(scenario.system.A), chain_of(scenario.links.observation.loss)
     order, rho, decay = finite_moment_order(A, losses), spectral_radius(A), losses.burst_decay
-    hidden = isinstance(losses, GilbertElliott)
+    hidden = isinstance(losses, Hidden)
     burst = f"θ = {decay:.6g}" if hidden else f"P(arrival after a loss) = {losses.recovery:.6g}"
     where, factor = f"ρ(A) = {rho:.6g}, {burst}", "θ" if hidden else "(1 − recovery)"
     growth = rho * rho  # a power would raise where this is infinite
@@ -224,7 +223,7 @@ def _bounds(conductor: Conductor) -> BoundFigures | None:
         upper["upper_correlated_mean"] = series.mean["upper_correlated"]
         upper["upper_correlated_stderr"] = series.stderr["upper_correlated"]
     reason: str | None = None
-    if correlation_factor(chain_of(scenario.links.control.loss)) is None:
+    if chain_of(scenario.links.control.loss).covariance_factor is None:
         reason = "the control losses never mix, and S holds for independent ones"
     if scenario.uncertainty is not None:
         reason = "the bounds are those of the nominal model, and the plant departs from it"

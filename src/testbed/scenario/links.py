@@ -3,11 +3,14 @@
 from typing import Literal
 
 from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from testbed.scenario.base import Part, problem, shown
 from testbed.scenario.durations import Duration
 from testbed.scenario.impairments import Corrupt, Delay, Duplicate, Rate, Reorder
-from testbed.scenario.losses import Loss, NoLoss
+from testbed.scenario.loss_laws import NoLoss
+from testbed.scenario.losses import Loss
+from testbed.scenario.replays import ScriptedLoss, TraceLoss
 
 
 class Impairments(Part):
@@ -78,3 +81,16 @@ class Links(Part):
     control: Link = Field(default_factory=Link, description="Controller to plant: u.")
     observation: ObservationLink = Field(default_factory=ObservationLink, description="Plant to estimators: y.")
     ack: AckLink = Field(default_factory=AckLink, description="Plant to estimators: which u were applied.")
+
+    def of_run(self, packets: int) -> "Links":
+        """For a run of so many packets a link: replayed losses with their law. A problem of validation if one ends."""
+        update = {}
+        for name in type(self).model_fields:
+            link: Impairments = getattr(self, name)
+            if isinstance(link.loss, (TraceLoss, ScriptedLoss)):
+                try:
+                    update[name] = link.model_copy(update={"loss": link.loss.of_run(packets)})
+                except PydanticCustomError as error:
+                    context = error.context or {}
+                    raise problem(context["text"], f"{name}.loss.{context['at']}") from None
+        return self.model_copy(update=update)

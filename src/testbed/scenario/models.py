@@ -69,6 +69,11 @@ class Scenario(Part):
                 raise problem(f"got {spec.until}; allowed: 1 … {steps}, the steps of the scenario", f"[{i}].until")
         return specs
 
+    @field_validator("links")
+    @classmethod
+    def _check_links(cls, links: Links, info: ValidationInfo) -> Links:
+        return links.of_run(info.data["steps"]) if "steps" in info.data else links
+
     @field_validator("input")
     @classmethod
     def _check_input(cls, source: Input | None, info: ValidationInfo) -> Input | None:
