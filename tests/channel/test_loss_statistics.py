@@ -60,6 +60,18 @@ def gilbert_elliott(to_bad: float, to_good: float, loss_good: float, loss_bad: f
     return Model({"kind": "gilbert-elliott", **names}, two(to_good, to_bad), [loss_bad, loss_good])
 
 
+def four_state(to_burst: float, to_good: float, to_pause: float, from_pause: float, to_isolated: float) -> Model:
+    """States good, pause within a burst, burst, isolated."""
+    names = {"to_burst": to_burst, "to_good": to_good, "to_pause": to_pause, "from_pause": from_pause}
+    moves = [
+        [1.0 - to_burst - to_isolated, 0.0, to_burst, to_isolated],
+        [0.0, 1.0 - from_pause, from_pause, 0.0],
+        [to_good, to_pause, 1.0 - to_good - to_pause, 0.0],
+        [1.0, 0.0, 0.0, 0.0],
+    ]
+    return Model({"kind": "four-state", **names, "to_isolated": to_isolated}, moves, [0.0, 0.0, 1.0, 1.0])
+
+
 MODELS = {
     "bernoulli 0.05": Model({"kind": "bernoulli", "loss": 0.05}, [[1.0]], [0.05]),
     "bernoulli 0.8": Model({"kind": "bernoulli", "arrival": 0.2}, [[1.0]], [0.8]),
@@ -68,6 +80,7 @@ MODELS = {
     "markov, by burst": Model({"kind": "markov", "loss": 0.1, "mean_burst": 4.0}, two(0.25, 1 / 36), [1.0, 0.0]),
     "gilbert-elliott": gilbert_elliott(0.02, 0.2, 0.01, 0.6),
     "gilbert-elliott, slow": gilbert_elliott(0.01, 0.03, 0.05, 0.5),
+    "four-state": four_state(0.02, 0.3, 0.2, 0.5, 0.01),
     "gilbert-elliott, alternating": gilbert_elliott(0.9, 0.8, 0.1, 0.7),
 }
 """To add a model is to add a line."""
@@ -150,7 +163,8 @@ def test_a_wrong_model_is_seen(name: str) -> None:
         off[state] *= 0.8
         off[state, state] += 0.2
         wrong = Model(model.loss, off.tolist(), model.lost)
-        assert min(transitions_p_value(wrong, bits), runs_p_value(wrong, bits, False)) < LEVEL
+        found = [transitions_p_value(wrong, bits), *(runs_p_value(wrong, bits, fate) for fate in (False, True))]
+        assert min(found) < LEVEL
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -19,7 +19,6 @@ from testbed.analysis.trace_order import Reordering, reordering
 from testbed.channel.law import LossModel, law_of, stationary_of
 from testbed.errors import UsageError
 from testbed.numerics.lanes import Bools, Floats
-from testbed.numerics.markov import mixing_sums
 
 _LAGS_MAX = 50
 _WINDOWS_MAX = 60
@@ -207,14 +206,7 @@ def _beside(arrived: Bools, model: Model, lags: int) -> ModelFigures:
 
 def share_of_losses(losses: LossModel, number: int) -> tuple[float, float]:
     """The probability of a loss and the standard deviation of the share lost of so many packets, stationary."""
-    law, pi = law_of(losses), stationary_of(losses)
-    lost = (~law.arrived).astype(np.float64)
-    rate = float(pi @ lost)
-    if not 0.0 < rate < 1.0:
-        return rate, 0.0
-    _, weighted = mixing_sums(law.transition, pi, number)
-    together = float((pi * lost) @ weighted @ lost)
-    return rate, math.sqrt(max(0.0, number * rate * (1.0 - rate) + 2.0 * together)) / number
+    return 1.0 - losses.arrival, math.sqrt(max(0.0, losses.share_moments(number)[1]))
 
 
 def correlation_of(losses: LossModel, lags: int) -> Floats:
