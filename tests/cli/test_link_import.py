@@ -36,6 +36,15 @@ def test_a_ping_log_becomes_a_trace_that_can_be_used(testbed: Command, tmp_path:
     assert (figures["sent"], figures["dropped"], figures["left_out"]) == (4, 1, {"not of ping": 1})
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_a_log_as_windows_writes_it(testbed: Command, tmp_path: Path, encoding: str) -> None:
+    text = "Reply from 10.0.0.2: bytes=32 time=14ms TTL=57\r\nRequest timed out.\r\n" + "x" * 10**6 + "\r\n"
+    (tmp_path / "ping.log").write_bytes(text.encode(encoding))
+    given = testbed("link", "import", "ping.log", "--out", "t.csv", "--json")
+    figures = json.loads(given.out)
+    assert (figures["sent"], figures["dropped"]) == (2, 1)
+
+
 def test_two_captures_with_all_options(testbed: Command, tmp_path: Path) -> None:
     frames = [
         Taken(k * MS, build.ethernet(build.ip4(build.udp(b"\x80\0" + k.to_bytes(2, "big") + b"12345678"), 17)))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from testbed.errors import UsageError
 from testbed.scenario.trace_file import Row
 
-PACKETS_MAX = 20_000_000
+PACKETS_MAX = 5_000_000
 
 
 @dataclass(frozen=True)

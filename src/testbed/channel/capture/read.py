@@ -15,6 +15,7 @@ from testbed.channel.capture.ping import ping_log
 from testbed.errors import UsageError
 
 Format = Literal["auto", "capture", "ping"]
+_LINE_MAX = 1000
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,9 @@ def import_trace(path: Path, wish: Wish) -> Imported:
         if wish.receiver is not None or wish.numbering is not None or wish.wanted != Filter():
             raise UsageError(f"{path}: got a log of ping; allowed with it: --interval and no other option")
         try:
-            with path.open(encoding="utf-8", errors="replace") as file:
-                return ping_log(file, str(path), wish.interval_ns)
+            with path.open(encoding=_encoding(path), errors="replace") as file:
+                lines = iter(lambda: file.readline(_LINE_MAX), "")
+                return ping_log(lines, str(path), wish.interval_ns)
         except OSError as error:
             raise _unreadable(path, error) from None
     if wish.interval_ns is not None:
@@ -66,6 +68,12 @@ def _format(path: Path, asked: Format) -> Format:
             return "capture" if is_capture(file.read(4)) else "ping"
     except OSError as error:
         raise _unreadable(path, error) from None
+
+
+def _encoding(path: Path) -> str:
+    """UTF-8, but for the files that PowerShell's redirection writes."""
+    with path.open("rb") as file:
+        return "utf-16" if file.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
 
 
 def _unreadable(path: Path, error: OSError) -> UsageError:
