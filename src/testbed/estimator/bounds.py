@@ -8,15 +8,26 @@ is enough for the best estimator; that is the *correlated* upper bound here. For
 δ² r^|i−j| Var(s_i), i < j, with s_i = 1 in the good state, r the memory of the states, and δ the difference of their
 arrival probabilities: ¼U (1 + 2 δ² |r|/(1 − |r|)) is enough. In general the factor of ¼U is the ``covariance_factor``
 of the losses.
+
+
+With an actuator that holds, what is not known is the applied input a_k, and ¼U is a bound of Var(B a_k). Under i.i.d.
+losses with arrival rate λ, E[a_j | a_i] − E[a_j] = (1 − λ)^(j−i) (a_i − E[a_i]) for i < j, so that Cov(a_i, a_j) =
+(1 − λ)^|i−j| Var(a_min(i,j)). As |v'Dw| ≤ ½ v'Dv + ½ w'Dw for each D = Var(a_i), white noise of the covariance
+¼U Σ_m (1 − λ)^|m| = ¼U (2 − λ)/λ a step is not below the joint covariance of the B a_k. It is enough for a linear
+filter, and so in the mean for the best estimator. For other losses, where how long an input is held depends on when it
+came, no bound is given.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache, partial
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+from testbed.channel.law import LossModel
 from testbed.estimator.model import Model
 from testbed.estimator.riccati import Gain, phi, predict
 from testbed.numerics.lanes import Constant, Floats, Mask, Matrix, constant, mask_of, matrices_of
@@ -24,31 +35,77 @@ from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 
+def held_factor(control: LossModel) -> float | None:
+    """(2 − λ)/λ, by which the holding of inputs adds up; None where no bound is known."""
+    if not control.independent or control.first_arrival == 0.0:
+        return None
+    return (2.0 - control.first_arrival) / control.first_arrival
+
+
 class CovarianceBound:
     """P_{k+1} = φ(A P_k A' + noise, γ_{k+1}) from P_0 in every lane: Pᴬ with noise Q, S with Q + ¼U."""
 
     def __init__(self, model: Model, noise: Floats, lanes: int) -> None:
-        _, self._p = model.prior(lanes)
+        _, self.p = model.prior(lanes)
         self._advance = _stepper(model, constant(noise), lanes)
 
     def step(self, arrived: NDArray[Any]) -> Matrix:
         """The bound after the observations ``arrived`` (M,) of the next step."""
-        (self._p,) = self._advance(mask_of(arrived), self._p)
-        return self._p
+        (self.p,) = self._advance(mask_of(arrived), self.p)
+        return self.p
 
 
 def upper_bound(model: Model, U: Floats, lanes: int) -> CovarianceBound:
-    """S for an input with B u_k u_k' B' ≤ U for all k."""
+    """S for an input with Var(ν_k B u_k) ≤ ¼U for all k, so with B u_k u_k' B' ≤ U."""
     return CovarianceBound(model, model.Q + 0.25 * U, lanes)
 
 
+class LateBound:
+    """Pᴬ_k given all observations of steps 1 … k that have arrived by k, late ones too.
+
+    Steps are remembered for ``depth``. What comes later than that counts as not arrived, and ``old`` counts it.
+    """
+
+    def __init__(self, model: Model, lanes: int, depth: int) -> None:
+        self._bound = CovarianceBound(model, model.Q, lanes)
+        self._depth, self._k, self.old = depth, 0, 0
+        self._states: dict[int, tuple[Matrix, NDArray[Any]]] = {}
+        """By step: what was known before it, and where its observation has arrived."""
+
+    def step(self, arrived: NDArray[Any], late: Iterable[tuple[int, NDArray[Any]]] = ()) -> Matrix:
+        """The bound after the next step's observations ``arrived`` (M,), and ``late`` ones: (step, lanes (M,))."""
+        again = self._k + 1
+        for step, lanes in late:
+            if step in self._states:
+                before, known = self._states[step]
+                self._states[step] = before, np.asarray(known, dtype=np.bool_) | np.asarray(lanes, dtype=np.bool_)
+                again = min(again, step)
+            else:
+                self.old += int(np.count_nonzero(lanes))
+        if again <= self._k:
+            self._bound.p = self._states[again][0]
+            for step in range(again, self._k + 1):
+                self._take(step, self._states[step][1])
+        self._k += 1
+        self._states.pop(self._k - self._depth, None)
+        return self._take(self._k, arrived)
+
+    def _take(self, step: int, arrived: NDArray[Any]) -> Matrix:
+        self._states[step] = self._bound.p, arrived
+        return self._bound.step(np.asarray(arrived, dtype=np.uint8))
+
+
 class Bounds:
-    """Lower: the ACK covariance Pᴬ. Upper: S, for an input with B u_k u_k' B' ≤ U for all k; none without U."""
+    """Lower: the ACK covariance Pᴬ. Upper: S, for an input with B u_k u_k' B' ≤ U for all k; none without U.
+
+    With an actuator that holds: Var(B a_k) ≤ ¼U for all k; none where losses are not i.i.d.
+    """
 
     def __init__(self, model: Model, U: Floats | None, lanes: int) -> None:
         self._lanes = lanes
         self._lower = CovarianceBound(model, model.Q, lanes)
-        self._upper = None if U is None else upper_bound(model, U, lanes)
+        factor = held_factor(model.control) if model.holds else 1.0
+        self._upper = None if U is None or factor is None else upper_bound(model, factor * U, lanes)
 
     def step(self, arrived: NDArray[Any]) -> tuple[Floats, Floats | None]:
         """Pᴬ_k and S_k, each (M, n, n), after the observations ``arrived`` (M,) of step k."""

@@ -117,6 +117,8 @@ class LinkFigures(_Model):
     duplicated: NonNegativeInt = 0
     late: NonNegativeInt = 0
     in_flight: NonNegativeInt = 0
+    corrupted: NonNegativeInt = Field(default=0, description="copies that arrived with a bit flipped")
+    causes: dict[str, NonNegativeInt] = Field(default_factory=dict, description="those dropped, by cause")
     transitions: Transitions = Transitions()
     loss_rate: Number = None
     mean_burst: Number = Field(default=None, description="mean number of packets lost in a row")
@@ -128,6 +130,15 @@ class Check(_Model):
     name: str
     ok: bool
     text: str
+
+
+class Happened(_Model):
+    """An event, and the step at which it took effect."""
+
+    step: NonNegativeInt
+    by: Literal["timeline", "command"] = Field(description="whether the scenario or somebody outside asked for it")
+    link: str = Field(description="which link")
+    set: dict[str, Any] = Field(description="keys of the link that changed")
 
 
 class Timing(_Model):
@@ -154,6 +165,7 @@ class Summary(_Model):
     estimators: dict[str, EstimatorFigures]
     bounds: BoundFigures | None = None
     links: dict[str, LinkFigures]
+    events: tuple[Happened, ...] = Field(default=(), description="what changed while the run went, in order of time")
     checks: tuple[Check, ...] = ()
     rejected: dict[str, dict[str, NonNegativeInt]] = Field(
         default_factory=dict, description="messages refused, by role and reason"
