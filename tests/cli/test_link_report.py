@@ -114,7 +114,7 @@ def test_beside_the_model_that_fits_best(testbed: Command, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("link", "notes", "theory"),
     [
-        ({**LINK, "clock": "time", "slot": "20 ms"}, ["the chain of the losses moves by time"], False),
+        ({**LINK, "clock": "time", "slot": "20 ms"}, ["losses have no law to compare with: their chain"], False),
         ({**LINK, "rate": {"bits_per_second": 1e6}}, [NO_LAW + "the queue adds"], False),
         (
             {**LINK, "rate": {"bits_per_second": 1e6, "queue_packets": 9}},
@@ -132,6 +132,8 @@ def test_beside_the_model_that_fits_best(testbed: Command, tmp_path: Path) -> No
             False,
         ),
         ({**LINK, "delay": {"kind": "constant", "by": "3 ms"}}, [], True),
+        ({**LINK, "corrupt": {"chance": 0.1}}, ["packets with a bit flipped are lost besides"], True),
+        ({**LINK, "loss": {"kind": "scripted", "lost": [3, 7]}}, ["losses have no law to compare with: they"], False),
     ],
 )
 def test_what_has_no_law_is_said(
@@ -142,7 +144,7 @@ def test_what_has_no_law_is_said(
     figures = json.loads(given.out)
     assert len(figures["notes"]) == len(notes)
     assert all(text.startswith(note) for text, note in zip(figures["notes"], notes, strict=True))
-    assert (figures["model"] is None) == ("slot" in link)
+    assert (figures["model"] is None) == ("slot" in link or link["loss"]["kind"] == "scripted")
     assert (figures["delays"][0]["theory"] is not None) == theory
 
 

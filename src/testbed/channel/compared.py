@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 from testbed.channel.chains import chain_of
 from testbed.channel.delay import Law, law_of
 from testbed.channel.law import LossModel
+from testbed.channel.service import loss_of
 from testbed.scenario import Scenario
 from testbed.scenario.impairments import ConstantDelay
 from testbed.wire.keys import LinkName
@@ -25,29 +28,42 @@ class Comparable:
 
 def comparable(scenario: Scenario, link: LinkName) -> Comparable:
     """The laws of a link, as far as they are those of its packets one by one."""
-    settings = getattr(scenario.links, link)
-    notes = []
-    losses: LossModel | None = chain_of(settings.loss)
-    if settings.loss.kind in _REPLAYED:
-        losses = None
-        notes.append("the losses are replayed: there is no law to compare with")
+    settings, loss = getattr(scenario.links, link), loss_of(scenario, link)
+    if why := _why_nothing_is_compared(scenario, link, settings):
+        return Comparable(None, None, (f"no law to compare with: {why}",))
+    notes, losses, delay = list(_besides(settings)), None, None
+    if loss.kind in _REPLAYED:
+        notes.append("losses have no law to compare with: they are replayed")
     elif settings.clock == "time":
-        losses = None
-        notes.append("the chain of the losses moves by time: by packet it has no law to compare with")
-    elif settings.rate is not None and (settings.rate.queue_packets or settings.rate.queue_bytes):
-        notes.append("the queue of the link may drop packets besides those that the loss model loses")
-    delay = None if settings.delay is None else law_of(settings.delay)
-    why = _why_delays_differ(settings)
-    if delay is not None and why:
-        delay = None
-        notes.append(f"delays have no law to compare with: {why}")
+        notes.append("losses have no law to compare with: their chain moves by time")
+    else:
+        losses = chain_of(loss)
+    if settings.delay is not None:
+        if why := _why_delays_differ(settings):
+            notes.append(f"delays have no law to compare with: {why}")
+        else:
+            delay = law_of(settings.delay)
     return Comparable(losses, delay, tuple(notes))
 
 
-def _why_delays_differ(settings: object) -> str:
-    rate, reorder, delay = (getattr(settings, key) for key in ("rate", "reorder", "delay"))
-    if rate is not None:
+def _why_nothing_is_compared(scenario: Scenario, link: LinkName, settings: Any) -> str:
+    if scenario.changes_of(link):
+        return "events of the scenario change the link"
+    carried = getattr(settings, "transport", None) is not None
+    return "what carries the messages decides over them too" if carried else ""
+
+
+def _besides(settings: Any) -> Iterable[str]:
+    if settings.rate is not None and (settings.rate.queue_packets or settings.rate.queue_bytes):
+        yield "the queue of the link may drop packets besides those that the loss model loses"
+    if settings.corrupt is not None:
+        yield "packets with a bit flipped are lost besides those that the loss model loses"
+
+
+def _why_delays_differ(settings: Any) -> str:
+    if settings.rate is not None:
         return "the queue adds to them"
-    if reorder is not None:
+    if settings.reorder is not None:
         return "some packets are held back"
-    return "packets wait for each other" if not isinstance(delay, ConstantDelay) and delay and delay.in_order else ""
+    in_order = not isinstance(settings.delay, ConstantDelay) and settings.delay.in_order
+    return "packets wait for each other" if in_order else ""
