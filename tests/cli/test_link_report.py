@@ -132,6 +132,7 @@ def test_beside_the_model_that_fits_best(testbed: Command, tmp_path: Path) -> No
             False,
         ),
         ({**LINK, "delay": {"kind": "constant", "by": "3 ms"}}, [], True),
+        ({**LINK, "transport": {"kind": "udp"}}, ["no law to compare with: what carries the messages"], False),
         ({**LINK, "corrupt": {"chance": 0.1}}, ["packets with a bit flipped are lost besides"], True),
         ({**LINK, "loss": {"kind": "scripted", "lost": [3, 7]}}, ["losses have no law to compare with: they"], False),
     ],
@@ -144,7 +145,7 @@ def test_what_has_no_law_is_said(
     figures = json.loads(given.out)
     assert len(figures["notes"]) == len(notes)
     assert all(text.startswith(note) for text, note in zip(figures["notes"], notes, strict=True))
-    assert (figures["model"] is None) == ("slot" in link or link["loss"]["kind"] == "scripted")
+    assert (figures["model"] is None) == ("slot" in link or "transport" in link or link["loss"]["kind"] == "scripted")
     assert (figures["delays"][0]["theory"] is not None) == theory
 
 

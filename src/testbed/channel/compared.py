@@ -49,7 +49,7 @@ def comparable(scenario: Scenario, link: LinkName) -> Comparable:
 def _why_nothing_is_compared(scenario: Scenario, link: LinkName, settings: Any) -> str:
     if scenario.changes_of(link):
         return "events of the scenario change the link"
-    carried = getattr(settings, "transport", None) is not None
+    carried = settings.transport is not None
     return "what carries the messages decides over them too" if carried else ""
 
 
