@@ -62,7 +62,9 @@ class SocketLink:
         Raises UsageError for an unknown direction or impairments that this link cannot express.
         """
         if direction not in DIRECTIONS:
-            raise UsageError(f"direction {direction!r}: allowed: forward, backward{did_you_mean(direction, DIRECTIONS)}")
+            raise UsageError(
+                f"direction {direction!r}: allowed: forward, backward{did_you_mean(direction, DIRECTIONS)}"
+            )
         self.check(settings)
         self._loop.call(lambda: self._pipelines[direction].change(settings))
 
@@ -104,8 +106,8 @@ class SocketLink:
         self.close()
 
     def _figures(self) -> Figures:
-        books = {direction: pipeline.books.as_counters() for direction, pipeline in self._pipelines.items()}
-        return Figures(dict(books), self._around())
+        books = {str(direction): pipeline.books.as_counters() for direction, pipeline in self._pipelines.items()}
+        return Figures(books, self._around())
 
     def _due(self, now_ns: int) -> int | None:
         """Do what is due; when to be called next."""

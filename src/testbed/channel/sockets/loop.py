@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,7 +18,7 @@ from testbed.errors import TestbedError
 Handler = Callable[[int], None]
 Result = TypeVar("Result")
 
-READ, WRITE, ENDED = select.EPOLLIN, select.EPOLLOUT, select.EPOLLHUP | select.EPOLLERR
+READ, WRITE, BROKEN = select.EPOLLIN, select.EPOLLOUT, select.EPOLLERR
 _SELECTABLE = 1024  # file descriptors that select() takes are below this
 _PATIENCE_S = 10.0
 
@@ -42,6 +43,7 @@ class Loop:
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._handlers: dict[int, Handler] = {self._wake: self._obey}
         self._epoll.register(self._wake, READ)
+        self._fresh: set[int] = set()
         self._orders: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._stopping = False
         self._start_ns = time.monotonic_ns()
@@ -62,6 +64,7 @@ class Loop:
             self._epoll.modify(fd, mask)
         else:
             self._epoll.register(fd, mask)
+            self._fresh.add(fd)
         self._handlers[fd] = handler
 
     def forget(self, fd: int) -> None:
@@ -128,9 +131,10 @@ class Loop:
                 if wait_ns > 0:
                     select.select((self._epoll,), (), (), wait_ns * 1e-9)
                 ready = poll(0)
+            self._fresh.clear()
             for fd, mask in ready:
                 handler = handlers.get(fd)
-                if handler is not None:
+                if handler is not None and fd not in self._fresh:  # else the news are of a socket closed just now
                     handler(mask)
 
     def _obey(self, _: int) -> None:
@@ -140,17 +144,14 @@ class Loop:
             try:
                 result = order()
             except BaseException as error:
-                future.set_exception(error)
+                with suppress(InvalidStateError):
+                    future.set_exception(error)
             else:
-                try:
+                with suppress(InvalidStateError):  # given up
                     future.set_result(result)
-                except InvalidStateError:  # given up
-                    pass
 
 
 def _wake_on_time() -> None:
     """Ask the kernel to wake this thread at the time it asked for, not up to 50 µs later."""
-    try:
+    with suppress(OSError):
         Path(f"/proc/{threading.get_native_id()}/timerslack_ns").write_text("1")
-    except OSError:
-        pass

@@ -11,8 +11,8 @@ from typing import Any
 from testbed.channel.sockets.buffers import dropped_by_kernel, enlarge
 from testbed.channel.sockets.endpoints import Endpoint
 from testbed.channel.sockets.link import COMPONENTS, DIRECTIONS, Direction, SocketLink
+from testbed.channel.sockets.listening import listening
 from testbed.channel.sockets.way import Send, Way
-from testbed.errors import UsageError
 from testbed.scenario.links import Impairments
 
 _BATCH = 64  # packets read from one socket before the others and the time get their turn
@@ -60,7 +60,9 @@ class UdpRelay(SocketLink):
         self._clients_max, self._idle_ns = clients_max, idle_ns
         self._refused = self._replaced = self._kernel_dropped = 0
         try:
-            super().__init__("udp relay", (forward or Impairments(), backward or Impairments()), seed, components, traces)
+            super().__init__(
+                "udp relay", (forward or Impairments(), backward or Impairments()), seed, components, traces
+            )
         except BaseException:
             self._listener.close()
             raise
@@ -161,18 +163,3 @@ class UdpRelay(SocketLink):
     def _end(self) -> None:
         for way in self._ways.values():
             way.end()
-
-
-def listening(at: Endpoint, kind: socket.SocketKind) -> socket.socket:
-    """A non-blocking socket bound there. Raises UsageError."""
-    family, address = at.resolve()
-    made = socket.socket(family, kind)
-    try:
-        made.setblocking(False)
-        if kind == socket.SOCK_STREAM:
-            made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        made.bind(address)
-    except OSError as error:
-        made.close()
-        raise UsageError(f"cannot listen on {at}: {(error.strerror or str(error)).lower()}") from None
-    return made
