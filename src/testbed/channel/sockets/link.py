@@ -31,8 +31,11 @@ class Figures:
 class SocketLink:
     """A link between real sockets, to be used in ``with``: it begins at the entry and ends at the exit.
 
+    address: where clients connect, host and port.
     The forward direction is from the clients to the target. Simulated time is the time since the link was made.
     """
+
+    address: tuple[str, int]
 
     def __init__(
         self,

@@ -49,7 +49,7 @@ class TcpProxy(SocketLink):
     ) -> None:
         self._family, self._target = Endpoint("tcp", *target).resolve()
         self._listener = listening(Endpoint("tcp", *listen), socket.SOCK_STREAM)
-        self.address: tuple[str, int] = self._listener.getsockname()[:2]
+        self.address = self._listener.getsockname()[:2]
         self._connections: list[Connection] = []
         self._connections_max, self._held_max = connections_max, held_max
         self._accepted = self._refused = self._resets = self._unreachable = 0

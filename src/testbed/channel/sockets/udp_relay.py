@@ -54,7 +54,7 @@ class UdpRelay(SocketLink):
     ) -> None:
         self._family, self._target = Endpoint("udp", *target).resolve()
         self._listener = listening(Endpoint("udp", *listen), socket.SOCK_DGRAM)
-        self.address: tuple[str, int] = self._listener.getsockname()[:2]
+        self.address = self._listener.getsockname()[:2]
         enlarge(self._listener)
         self._clients: dict[Any, _Client] = {}
         self._clients_max, self._idle_ns = clients_max, idle_ns
