@@ -14,18 +14,9 @@ from testbed.scenario.inputs import (
     TableInput,
     UniformInput,
 )
-from testbed.scenario.links import (
-    AckLink,
-    BernoulliLoss,
-    GilbertElliottLoss,
-    Link,
-    Links,
-    Loss,
-    MarkovLoss,
-    NoLoss,
-    ObservationLink,
-)
+from testbed.scenario.links import AckLink, Link, Links, ObservationLink
 from testbed.scenario.load import load_scenario, parse_scenario
+from testbed.scenario.losses import BernoulliLoss, GilbertElliottLoss, Loss, MarkovLoss, NoLoss
 from testbed.scenario.models import Scenario
 from testbed.scenario.schema import scenario_json_schema
 from testbed.scenario.system import System

@@ -1,6 +1,6 @@
 """What a link does to a packet besides losing it: rate and queue, delay, order, copies, bit errors.
 
-The losses are in links.py. What a link of these does, stage by stage, is in testbed.channel.pipeline.
+The losses are in losses.py. What a link of these does, stage by stage, is in testbed.channel.pipeline.
 """
 
 from typing import Annotated, Any, ClassVar, Literal
