@@ -14,7 +14,6 @@ from testbed.cli.link_names import link_name
 from testbed.errors import UsageError
 
 app = typer.Typer(help="Look at one link: of a scenario, or of a trace.", rich_markup_mode=None)
-app.command("relay")(link_relay.relay)
 
 _LANE_MAX = 2**31 - 2  # the last lane of the largest scenario
 
@@ -94,3 +93,6 @@ def fit(
 
 def _shown(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
+
+
+app.command("relay")(link_relay.relay)
