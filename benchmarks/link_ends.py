@@ -1,6 +1,7 @@
 """The two ends of a link in processes of their own: a source and a sink, over bare sockets or over zenoh.
 
-A message of 64 bytes has its number and the time at which it was sent, by the machine's monotonic clock. The sink tells how far it is through a shared file, so that a flood has a window whatever lies in between.
+A message of 64 bytes has its number and the time at which it was sent, by the machine's monotonic clock. The sink
+tells how far it is through a shared file, so that a flood has a window whatever lies in between.
 """
 
 from __future__ import annotations
