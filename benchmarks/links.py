@@ -31,7 +31,7 @@ _DELAYS_US = (300, 1_000, 10_000)
 
 
 def run(*, quick: bool) -> Figures:
-    repetitions = 2 if quick else 7
+    repetitions = 2 if quick else 5
     work = Work(30, 200, 0.3) if quick else Work(100, 500, 1.0)
     figures = Figures("links")
     _ends(figures, repetitions, work)

@@ -11,7 +11,7 @@ from typing import Any
 
 from testbed.channel.pipeline import Pipeline
 from testbed.channel.sockets.link import Direction
-from testbed.channel.sockets.loop import BROKEN, READ, WRITE, Loop
+from testbed.channel.sockets.loop import READ, WRITE, Loop
 from testbed.channel.sockets.stream import Stream
 from testbed.channel.sockets.tracing import TraceWriter
 
@@ -91,8 +91,6 @@ class Connection:
         now_ns = self._loop.now_ns
 
         def act() -> None:
-            if mask & BROKEN:
-                raise ConnectionResetError
             if mask & WRITE:
                 writes.write(now_ns)
             if mask & READ and reads.reads:

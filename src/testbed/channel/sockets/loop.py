@@ -18,7 +18,7 @@ from testbed.errors import TestbedError
 Handler = Callable[[int], None]
 Result = TypeVar("Result")
 
-READ, WRITE, BROKEN = select.EPOLLIN, select.EPOLLOUT, select.EPOLLERR
+READ, WRITE = select.EPOLLIN, select.EPOLLOUT
 _SELECTABLE = 1024  # file descriptors that select() takes are below this
 _PATIENCE_S = 10.0
 
