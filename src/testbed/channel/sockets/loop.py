@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, InvalidStateError
+from concurrent.futures import CancelledError, Future, InvalidStateError
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +21,7 @@ Result = TypeVar("Result")
 READ, WRITE = select.EPOLLIN, select.EPOLLOUT
 _SELECTABLE = 1024  # file descriptors that select() takes are below this
 _PATIENCE_S = 10.0
+_NAP_S = 3600.0  # at most so long at once: select() takes no century
 
 
 class LinkFailed(TestbedError):
@@ -84,8 +85,10 @@ class Loop:
             except TimeoutError:
                 if future.done():
                     raise
-                if not self._thread.is_alive() and future.cancel():
-                    raise LinkFailed(f"{self._thread.name}: it ended meanwhile") from self.failure
+                if not self._thread.is_alive():
+                    future.cancel()
+            except CancelledError:
+                raise LinkFailed(f"{self._thread.name}: it ended meanwhile") from self.failure
 
     def wait(self, seconds: float | None = None) -> bool:
         """Whether the loop ended within so many seconds. Raises LinkFailed where an error ended it."""
@@ -117,8 +120,8 @@ class Loop:
             self.failure = error
         finally:
             self._ended.set()
-            for _, future in self._orders:
-                future.cancel()
+            while self._orders:
+                self._orders.popleft()[1].cancel()
 
     def _turn(self) -> None:
         poll, handlers = self._epoll.poll, self._handlers
@@ -129,7 +132,7 @@ class Loop:
             else:
                 wait_ns = next_ns - self.now_ns
                 if wait_ns > 0:
-                    select.select((self._epoll,), (), (), wait_ns * 1e-9)
+                    select.select((self._epoll,), (), (), min(wait_ns * 1e-9, _NAP_S))
                 ready = poll(0)
             self._fresh.clear()
             for fd, mask in ready:
