@@ -32,6 +32,7 @@ _BUFFER_BYTES, _SO_RCVBUFFORCE = 2**22, 33
 _PACKET_BYTES = 1024  # of a socket's buffer that a small packet takes, at most
 _PATIENCE_S = 30.0
 _SILENCE_S = 1.0  # after which nothing more is expected
+_NAP_S, _BURST = 2e-4, 16
 _KEY = "bench/link"
 
 
@@ -256,9 +257,9 @@ def source(kind: str, host: str, port: int, shared: Shared, work: Work) -> None:
             elif now > silent + _SILENCE_S:
                 break
             if now >= until or number - seen >= window:
-                time.sleep(2e-5)
+                time.sleep(_NAP_S)
                 continue
-            for _ in range(8):
+            for _ in range(_BURST):
                 put(_HEAD.pack(number, time.monotonic_ns(), number) + padding)
                 number += 1
         shared.end()

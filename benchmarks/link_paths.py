@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -10,13 +11,13 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
-from benchmarks.cpu import usage_of
+from benchmarks.cpu import Busy, usage_of
 from benchmarks.link_ends import Found, Shared, Work, scheme
 
 _PATIENCE_S = 60.0
@@ -26,11 +27,27 @@ Start = Callable[..., subprocess.Popen[Any]]
 
 @dataclass(frozen=True)
 class Run:
-    """What the ends found; the books of the backend on the way to the sink, and the CPU time it took."""
+    """What the ends found; the books of the backend on the way to the sink, and the CPU time it took.
+
+    others: CPUs that the rest of the machine kept busy meanwhile.
+    """
 
     found: Found
     books: dict[str, int] = field(default_factory=dict)
     cpu_s: float = 0.0
+    others: float = 0.0
+
+
+def measured(case: Callable[[], Run]) -> Run:
+    """Run a case, and see how busy others are."""
+    busy, before = Busy(), _own_s()
+    run = case()
+    return replace(run, others=busy.others(_own_s() - before))
+
+
+def _own_s() -> float:
+    """CPU seconds of this process and of those that it started and that have ended."""
+    return sum(os.times()[:4])
 
 
 def direct(kind: str, work: Work) -> Run:

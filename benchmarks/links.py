@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.figures import Figures, Median, Target, alternate, ratios
 from benchmarks.link_ends import KINDS, Found, Work, median
-from benchmarks.link_paths import Kernel, Run, direct, relayed
+from benchmarks.link_paths import Kernel, Run, direct, measured, relayed
 
 _LOSSES = {"kind": "markov", "loss": 0.05, "mean_burst": 3.0}
 _JITTER = {"kind": "uniform", "low": "1 ms", "high": "2 ms"}
@@ -51,7 +51,9 @@ def _ends(figures: Figures, repetitions: int, work: Work) -> None:
     else:
         figures.notes.append(f"TUN not available: {kernel.missing}")
     cases = {
-        (kind, path): (lambda kind=kind, run=run: run(kind, work)) for kind in KINDS for path, run in paths.items()
+        (kind, path): (lambda kind=kind, run=run: measured(lambda: run(kind, work)))
+        for kind in KINDS
+        for path, run in paths.items()
     }
     results = alternate(repetitions, {f"{kind}, {path}": case for (kind, path), case in cases.items()})
     for kind, path in cases:
@@ -68,6 +70,7 @@ def _ends(figures: Figures, repetitions: int, work: Work) -> None:
         if path != "direct":
             row["added at 100 Hz"] = _added(ours, beside, "slow_us")
             row["added at 1 kHz"] = _added(ours, beside, "fast_us")
+        row["CPUs of others"] = Median.of([each.others for each in ours])
         row["lost in flood"] = max(each.found.lost for each in ours)
         figures.rows.append(row)
         if (kind, path) == ("udp socket", "relay"):
@@ -103,7 +106,10 @@ def _alone(keys: dict[str, Any], seconds: float) -> float:
 def _relay_at_work(figures: Figures, repetitions: int, work: Work) -> None:
     """The relay with impairments: its rate, and how exactly it keeps a delay."""
     flood, paced = Work(0, 0, work.flood_s), Work(0, work.fast, 0.0)
-    busy = {name: lambda keys=keys: relayed("udp socket", flood, keys) for name, keys in _PIPELINES.items()}
+    busy = {
+        name: lambda keys=keys: measured(lambda: relayed("udp socket", flood, keys))
+        for name, keys in _PIPELINES.items()
+    }
     delays = {
         f"{us} µs": lambda us=us: relayed("udp socket", paced, {"delay": {"kind": "constant", "by": f"{us} us"}})
         for us in _DELAYS_US
@@ -114,11 +120,14 @@ def _relay_at_work(figures: Figures, repetitions: int, work: Work) -> None:
             "impairments": name,
             "packets/s in": Median.of([each.found.rate / (1 - each.found.lost) for each in results[name]]),
             "CPU µs/packet": Median.of([_cpu_us(each) for each in results[name]]),
+            "CPUs of others": Median.of([each.others for each in results[name]]),
             "dropped": Median.of([each.books["dropped"] / each.books["sent"] for each in results[name]]),
             "dropped by the kernel": max(each.books["kernel_dropped"] for each in results[name]),
         }
         for name in busy
     ]
+    cpu_us = Median.of([_cpu_us(each) for each in results["nothing"]]).value
+    figures.targets.append(Target("UDP relay, packets in a second of its own CPU time", 1e6 / cpu_us, 50_000))
     beside = [median(each.found.fast_us) for each in results["none"]]
     figures.tables["UDP relay, delay kept at 1 kHz"] = [
         {

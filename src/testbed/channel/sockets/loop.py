@@ -21,6 +21,7 @@ Result = TypeVar("Result")
 READ, WRITE = select.EPOLLIN, select.EPOLLOUT
 _SELECTABLE = 1024  # file descriptors that select() takes are below this
 _PATIENCE_S = 10.0
+_SPIN_NS = 50_000  # it takes about so long to wake up: the rest of a wait is spent awake
 _NAP_S = 3600.0  # at most so long at once: select() takes no century
 
 
@@ -131,8 +132,8 @@ class Loop:
                 ready = poll()
             else:
                 wait_ns = next_ns - self.now_ns
-                if wait_ns > 0:
-                    select.select((self._epoll,), (), (), min(wait_ns * 1e-9, _NAP_S))
+                if wait_ns > _SPIN_NS:
+                    select.select((self._epoll,), (), (), min((wait_ns - _SPIN_NS) * 1e-9, _NAP_S))
                 ready = poll(0)
             self._fresh.clear()
             for fd, mask in ready:
