@@ -14,7 +14,7 @@ import pytest
 
 from channel.sockets.ends import datagram, number_of, udp_socket
 from cli.commands import Command, testbed, write
-from testbed.channel.trace import read_fates
+from testbed.scenario.trace_file import read_fates
 
 __all__ = ["testbed"]
 UDP = ("--listen", "udp/127.0.0.1:0", "--to", "udp/127.0.0.1:7447")

@@ -26,8 +26,8 @@ from channel.sockets.ends import (
 from testbed.channel.pipeline import Pipeline
 from testbed.channel.sockets.udp_relay import UdpRelay
 from testbed.channel.sockets.way import flipped
-from testbed.channel.trace import read_fates
 from testbed.errors import UsageError
+from testbed.scenario.trace_file import read_fates
 
 PACKETS = 2000
 BURSTY = {"kind": "markov", "recovery": 0.25, "failure": 0.05}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from testbed.channel.trace import HEADER
 from testbed.errors import RunFailed, UsageError
+from testbed.scenario.trace_file import HEADER
 
 
 class TraceWriter:
