@@ -62,7 +62,7 @@ def test_the_table_has_both_directions_and_what_is_around(testbed: Command):
     head, forward, backward, around = outcome.out.splitlines()
     assert head.split() == ["sent", "delivered", "dropped", "duplicated", "corrupted", "in", "flight"]
     assert (forward.split()[0], backward.split()[0]) == ("forward", "backward")
-    assert around.startswith("clients 0, replaced 0, refused 0, unreachable 0, kernel dropped 0; ")
+    assert around.startswith("clients 0, replaced 0, refused 0, unreachable 0, kernel dropped 0, overdue 0; ")
     assert outcome.err.startswith("control: udp/127.0.0.1:")
 
 

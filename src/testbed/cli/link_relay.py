@@ -145,4 +145,4 @@ def _show(figures: Figures, seconds: float) -> None:
     console = Console(highlight=False)
     console.print(shown)
     around = ", ".join(f"{key.replace('_', ' ')} {count}" for key, count in figures.around.items())
-    console.print(f"{around}; {seconds:.1f} s")
+    console.print(f"{around}; {seconds:.1f} s", soft_wrap=True)

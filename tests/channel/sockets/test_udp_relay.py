@@ -295,6 +295,19 @@ def test_packets_that_the_kernel_drops_are_counted():
     assert 0 < dropped == link.figures().around["kernel_dropped"]
 
 
+def test_packets_that_the_relay_hands_on_too_late_are_counted():
+    soon = impairments(delay={"kind": "constant", "by": "1 min"})
+    with udp_ends(partial(UdpRelay, forward=soon)) as (link, client, target):
+        for number in range(10):
+            client.send(datagram(number))
+        until(lambda: link.figures().directions["forward"]["sent"] == 10, "all read")
+        loop = link._loop
+        loop.call(lambda: setattr(loop, "_start_ns", loop._start_ns - 62 * 10**9))  # as if it had slept so long
+        assert len(received(target, 10)) == 10
+        settled(link, 10)
+        assert link.figures().around["overdue"] == 10
+
+
 def test_no_thread_and_no_socket_is_left():
     threads, files = set(threading.enumerate()), open_files()
     with udp_ends(UdpRelay) as (_, client, target):

@@ -53,10 +53,10 @@ class Connection:
         else:
             self.reset()
 
-    def move(self, direction: Direction, now_ns: int) -> None:
-        """Hand on what is due in a direction."""
+    def move(self, direction: Direction, now_ns: int, stalled_ns: int) -> None:
+        """Hand on what is due in a direction that was stalled until ``stalled_ns``."""
         stream = self.streams[direction]
-        if stream.move(now_ns):
+        if stream.move(now_ns, stalled_ns):
             self._guarded(lambda: stream.write(now_ns))
 
     def reset(self) -> None:

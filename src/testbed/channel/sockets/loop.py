@@ -20,6 +20,8 @@ Result = TypeVar("Result")
 
 READ, WRITE = select.EPOLLIN, select.EPOLLOUT
 _SELECTABLE = 1024  # file descriptors that select() takes are below this
+OVERDUE_NS = 1_000_000
+"""What is done later than this after it was due is counted."""
 _PATIENCE_S = 10.0
 _SPIN_NS = 50_000  # it takes about so long to wake up: the rest of a wait is spent awake
 _NAP_S = 3600.0  # at most so long at once: select() takes no century

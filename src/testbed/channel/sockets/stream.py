@@ -7,6 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from testbed.channel.pipeline import Pipeline
+from testbed.channel.sockets.loop import OVERDUE_NS
 from testbed.channel.sockets.tracing import TraceWriter
 
 _SEGMENT = 1448  # bytes that one packet of a connection over Ethernet carries
@@ -45,6 +46,8 @@ class Stream:
         self._latest_ns = 0
         self._way: deque[Chunk] = deque()
         self._out: deque[Chunk] = deque()
+        self.overdue = 0
+        """Chunks handed on more than 1 ms late."""
         self.ended = False
         """The source sent the end of its stream."""
         self.shut = False
@@ -87,12 +90,14 @@ class Stream:
             self._way.append(Chunk(number, now_ns, chunk, self._latest_ns))
             self._held += len(chunk) + _CHUNK_BYTES
 
-    def move(self, now_ns: int) -> bool:
-        """Hand on what is due; whether there was any."""
+    def move(self, now_ns: int, stalled_ns: int) -> bool:
+        """Hand on what is due, with a stall until ``stalled_ns`` behind us; whether there was any."""
         if not self._way or self._way[0].at_ns > now_ns:
             return False
         while self._way and self._way[0].at_ns <= now_ns:
-            self._out.append(self._way.popleft())
+            chunk = self._way.popleft()
+            self.overdue += now_ns - max(chunk.at_ns, stalled_ns) > OVERDUE_NS
+            self._out.append(chunk)
         return True
 
     def write(self, now_ns: int) -> None:

@@ -52,7 +52,7 @@ class TcpProxy(SocketLink):
         self.address = self._listener.getsockname()[:2]
         self._connections: list[Connection] = []
         self._connections_max, self._held_max = connections_max, held_max
-        self._accepted = self._refused = self._resets = self._unreachable = 0
+        self._accepted = self._refused = self._resets = self._unreachable = self._overdue = 0
         self._stalled_ns: dict[Direction, int] = dict.fromkeys(DIRECTIONS, 0)
         self._closed_ns: int | None = None
         self._outages: Schedule[Outage] = Schedule()
@@ -146,6 +146,7 @@ class TcpProxy(SocketLink):
 
     def _gone(self, connection: Connection, reset: bool) -> None:
         self._connections.remove(connection)
+        self._overdue += _overdue(connection)
         if not connection.connected:
             self._unreachable += 1
         elif reset:
@@ -164,7 +165,7 @@ class TcpProxy(SocketLink):
             stalled_ns = self._stalled_ns[direction]
             for connection in tuple(self._connections):
                 if stalled_ns <= now_ns:
-                    connection.move(direction, now_ns)
+                    connection.move(direction, now_ns, stalled_ns)
                 next_ns = connection.streams[direction].next_ns
                 times.append(None if next_ns is None else max(next_ns, stalled_ns))
         return min((at_ns for at_ns in times if at_ns is not None), default=None)
@@ -176,6 +177,7 @@ class TcpProxy(SocketLink):
             "refused": self._refused,
             "unreachable": self._unreachable,
             "resets": self._resets,
+            "overdue": self._overdue + sum(map(_overdue, self._connections)),
         }
 
     def _held(self, direction: Direction) -> int:
@@ -190,3 +192,7 @@ class TcpProxy(SocketLink):
         for connection in self._connections:
             for stream in connection.streams.values():
                 stream.end()
+
+
+def _overdue(connection: Connection) -> int:
+    return sum(stream.overdue for stream in connection.streams.values())

@@ -148,6 +148,7 @@ class UdpRelay(SocketLink):
             "refused": self._refused,
             "unreachable": self._forward.unreachable + self._backward.unreachable,
             "kernel_dropped": self._kernel_dropped + lost,
+            "overdue": self._forward.overdue + self._backward.overdue,
         }
 
     def _held(self, direction: Direction) -> int:

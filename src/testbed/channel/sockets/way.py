@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from testbed.channel.pipeline import Pipeline
 from testbed.channel.schedule import Schedule
+from testbed.channel.sockets.loop import OVERDUE_NS
 from testbed.channel.sockets.tracing import TraceWriter
 
 Send = Callable[[bytes], object]
@@ -18,12 +19,13 @@ class Way:
     """Takes packets, and hands each to its socket when the pipeline says, in the books of the pipeline.
 
     Causes of drops beyond those of the pipeline: "overflow", when more is on its way than ``held_max`` bytes;
-    "socket", when the socket refuses the packet. unreachable: how often the system reported that nobody listened.
+    "socket", when the socket refuses the packet.
+    unreachable: how often the system reported that nobody listened. overdue: copies handed on more than 1 ms late.
     """
 
     def __init__(self, pipeline: Pipeline, trace: TraceWriter | None, held_max: int) -> None:
         self.pipeline, self.trace = pipeline, trace
-        self.unreachable = 0
+        self.unreachable = self.overdue = 0
         self._schedule: Schedule[tuple[int, int, bytes, Send]] = Schedule()
         self._held, self._held_max = 0, held_max
 
@@ -55,7 +57,8 @@ class Way:
         next_ns = schedule.next_ns
         if next_ns is None or next_ns > now_ns:
             return next_ns
-        for _, (number, sent_ns, data, send) in schedule.due(now_ns):
+        for at_ns, (number, sent_ns, data, send) in schedule.due(now_ns):
+            self.overdue += now_ns - at_ns > OVERDUE_NS
             self._held -= len(data) + _PACKET_BYTES
             self._deliver(number, sent_ns, data, send, now_ns)
         return schedule.next_ns
