@@ -15,6 +15,7 @@ from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain, LossCounts
 from testbed.channel.steps import SteppedLink
 from testbed.numerics.lanes import Floats
+from testbed.scenario import ScriptedLoss, TraceLoss
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.impairments import ConstantDelay
 from testbed.scenario.links import SteppedImpairments
@@ -28,11 +29,13 @@ def law_in_steps(link: SteppedImpairments, period_ns: int) -> LossModel:
     """The losses of a link as they are seen from step to step, a packet a period.
 
     ``assumed`` where it is given. Otherwise exact, but for a clock whose slots do not divide the period (there, the
-    mean over their phases), where packets do not depend on each other but through the chain; with a bottleneck or with
-    delays in order, the Markov chain that fits the counts of a sample of 20,000 packets.
+    mean over their phases), where packets do not depend on each other but through the chain; with a bottleneck,
+    with delays in order or with a transport, the Markov chain that fits the counts of a sample of 20,000 packets.
     """
     if link.assumed is not None:
         return chain_of(link.assumed)
+    if isinstance(link.loss, TraceLoss | ScriptedLoss):
+        link = link.model_copy(update={"loss": link.loss.law})
     if not link.takes_time:
         return chain_of(link.loss)
     if has_formula(link):
@@ -42,8 +45,9 @@ def law_in_steps(link: SteppedImpairments, period_ns: int) -> LossModel:
 
 def has_formula(link: SteppedImpairments) -> bool:
     """Whether the fates of packets depend on each other through the chain of the losses alone."""
-    delay = link.delay
-    return link.rate is None and (delay is None or isinstance(delay, ConstantDelay) or not delay.in_order)
+    if link.rate is not None or link.transport is not None:
+        return False
+    return link.delay is None or isinstance(link.delay, ConstantDelay) or not link.delay.in_order
 
 
 def _exact(link: SteppedImpairments, period_ns: int) -> LossModel:
