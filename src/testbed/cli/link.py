@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from testbed.cli import link_relay
 from testbed.cli.link_import import import_
 from testbed.cli.link_names import link_name
 from testbed.cli.link_presets import presets
@@ -120,3 +121,6 @@ def set_(
 
 def _shown(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
+
+
+app.command("relay")(link_relay.relay)
