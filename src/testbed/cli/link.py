@@ -5,12 +5,13 @@ from __future__ import annotations
 import json as json_format
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import Annotated
 
 import typer
 
-from testbed.errors import UsageError, did_you_mean
-from testbed.wire.keys import LinkName
+from testbed.cli import link_doctor, link_hosts
+from testbed.cli.link_names import link_name
+from testbed.errors import UsageError
 
 app = typer.Typer(help="Look at one link: of a scenario, or of a trace.", rich_markup_mode=None)
 
@@ -41,7 +42,7 @@ def sample(
     from testbed.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    link = _link(name)
+    link = link_name(name)
     if lane > _LANE_MAX:
         raise UsageError(f"--lane {lane}: allowed: 0 … {_LANE_MAX}")
     if link == "ack" and loaded.links.ack.mode == "none":
@@ -90,12 +91,10 @@ def fit(
     show(str(trace), fitted, fates.duplicates)
 
 
-def _link(name: str) -> LinkName:
-    names = get_args(LinkName)
-    if name not in names:
-        raise UsageError(f"--link {name}: no such link; allowed: {', '.join(names)}{did_you_mean(name, names)}")
-    return cast(LinkName, name)
-
-
 def _shown(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
+
+
+app.command("hosts")(link_hosts.hosts)
+app.command("doctor")(link_doctor.doctor)
+app.command("clean")(link_doctor.clean)
