@@ -1,4 +1,4 @@
-"""Slow tests: skipped unless asked for, and the end of the output says so."""
+"""Slow tests: skipped unless asked for, and the end of the output says so. Those marked root: where they cannot run."""
 
 from __future__ import annotations
 
@@ -12,11 +12,23 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    _skip_without_namespaces([item for item in items if "root" in item.keywords])
     if config.getoption("--run-slow"):
         return
     for item in items:
         if "slow" in item.keywords:
             item.add_marker(pytest.mark.skip(reason=_REASON))
+
+
+def _skip_without_namespaces(items: list[pytest.Item]) -> None:
+    if not items:
+        return
+    from testbed.channel.kernel.doctor import examine
+
+    finding = next(finding for finding in examine() if finding.what == "hosts, backend tun")
+    if not finding.ok:
+        for item in items:
+            item.add_marker(pytest.mark.skip(reason=f"root: {finding.found}"))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

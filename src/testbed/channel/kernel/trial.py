@@ -1,4 +1,4 @@
-"""What works here, tried in namespaces that are gone with this process: ``python -m testbed.channel.kernel.trial KIND``.
+"""What works here, tried in namespaces that go with this process: ``python -m testbed.channel.kernel.trial KIND``.
 
 KIND: "root", with the rights that there are, or "user", within a user namespace. Prints JSON: by step, null where it
 works, else why not; a step after a failed one that it needs is left out.
