@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
 
 _REASON = "slow: run with --run-slow"
@@ -29,6 +34,17 @@ def _skip_without_namespaces(items: list[pytest.Item]) -> None:
     if not finding.ok:
         for item in items:
             item.add_marker(pytest.mark.skip(reason=f"root: {finding.found}"))
+
+
+@pytest.fixture(autouse=True)
+def _one_with_hosts_at_a_time(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Across processes: each removes what dead owners left, and some want to see that themselves."""
+    if "root" not in request.keywords:
+        yield
+        return
+    with (Path(tempfile.gettempdir()) / "testbed-tests-hosts.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

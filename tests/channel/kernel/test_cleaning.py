@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 
@@ -81,7 +80,8 @@ def test_what_outlives_owner_and_engine_is_removed_at_the_next_start_and_the_liv
             removed = {one.pid: one for one in pair.removed}
             assert removed[dead.child].hosts == dead.mark
             assert "sleep 1000" in removed[dead.child].command
-            assert dead.gone()
+            assert not alive(dead.shell)
+            assert not alive(dead.child)
             assert not {living.engine, living.shell, living.child} & set(removed)
             assert all(alive(pid) for pid in (living.engine, living.shell, living.child))
         assert not [one for one in clean() if one.hosts in (dead.mark, living.mark)]
@@ -115,7 +115,8 @@ def test_what_is_no_mark_has_no_dead_owner() -> None:
         assert owner_lives(text)
 
 
-def test_only_marked_processes_are_ended(tmp_path: Path) -> None:
+@pytest.mark.root
+def test_only_marked_processes_are_ended() -> None:
     """One with the mark of a dead owner, one with another variable, one with the mark of this process."""
     dead = "tb-4194305-1-00000000"  # beyond the greatest process number
     environments = [{"TESTBED_HOSTS": dead}, {"OTHER": dead}, {"TESTBED_HOSTS": new_mark()}]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from typing import Any
 
 import pytest
@@ -115,8 +116,6 @@ def test_netem_loses_on_the_way_to_the_receiver() -> None:
 
 
 def _need_tools() -> None:
-    import shutil
-
     for tool in ("ip", "tc"):
         if shutil.which(tool) is None:
             pytest.skip(f"there is no command {tool}")
