@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.hidden import Hidden
 from testbed.channel.loss import Chain
 
 Bools = NDArray[np.bool_]
@@ -28,6 +29,16 @@ def markov(number: int, chain: Chain, seed: int) -> Bools:
 def gilbert_elliott(number: int, losses: GilbertElliott, seed: int) -> Bools:
     good = markov(number, losses.states, seed)
     return np.random.default_rng([seed, 1]).random(number) >= np.where(good, losses.loss_good, losses.loss_bad)
+
+
+def hidden(number: int, losses: Hidden, seed: int) -> Bools:
+    """A packet meets a state, which decides over its fate; then the state moves."""
+    points = np.random.default_rng(seed).random((number, 2))
+    ends, state, out = losses.transition.cumsum(axis=1)[:, :-1], 0, []
+    for k, (drop, move) in enumerate(points.tolist()):
+        state = int((move >= (ends[state] if k else losses.initial.cumsum()[:-1])).sum())
+        out.append(drop >= losses.loss[state])
+    return np.array(out)
 
 
 def probability(fates: tuple[bool, ...], losses: GilbertElliott) -> float:

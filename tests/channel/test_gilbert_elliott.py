@@ -167,7 +167,7 @@ def test_what_is_a_chain_of_arrivals_is_taken_for_one(losses: GilbertElliott, ch
 
 def test_what_holds_for_chains_alone_says_so() -> None:
     for name in ("recovery", "failure", "start"):
-        with pytest.raises(UsageError, match="Gilbert-Elliott losses have no recovery and failure rate"):
+        with pytest.raises(UsageError, match="losses with a hidden state have no recovery and failure rate"):
             getattr(CHANNELS["noisy"], name)
 
 

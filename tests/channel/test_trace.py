@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from testbed.channel.service import loss_process
-from testbed.channel.trace import read_fates, sample_trace, write_trace
+from testbed.channel.trace import sample_trace, write_trace
 from testbed.errors import UsageError
 from testbed.scenario import Scenario, parse_scenario
+from testbed.scenario.trace_file import read_fates
 
 
 def scenario(loss: dict[str, Any], **rest: Any) -> Scenario:

@@ -92,8 +92,8 @@ def test_a_wrong_command_line(arguments: list[str], expected: str, testbed: Comm
         ),
         (
             {"links": {"control": {"loss": {"kind": "bernoully"}}}},
-            "wrong.toml: links.control.loss.kind: got 'bernoully'; allowed: none, bernoulli, markov, gilbert-elliott; "
-            "did you mean",
+            "wrong.toml: links.control.loss.kind: got 'bernoully'; allowed: none, bernoulli, markov, gilbert-elliott, "
+            "four-state, trace, scripted; did you mean",
         ),
         (
             {"links": {"control": {"los": {"kind": "none"}}}},

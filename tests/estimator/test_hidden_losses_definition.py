@@ -1,4 +1,4 @@
-"""Estimators under Gilbert–Elliott control losses: by enumeration, by their definitions, and where these are chains."""
+"""Estimators under control losses with a hidden state: by enumeration, by definition, and where these are chains."""
 
 from __future__ import annotations
 
@@ -11,19 +11,30 @@ from hypothesis import given
 
 from estimator.agreement import assert_same
 from estimator.reference import gaussian, hidden
-from estimator.reference.cases import ACKS, HIDDEN, Channel, Floats, Trial, check, random_system, random_trial, trials
+from estimator.reference.cases import (
+    ACKS,
+    FOUR,
+    HIDDEN,
+    Channel,
+    Floats,
+    Trial,
+    check,
+    random_system,
+    random_trial,
+    trials,
+)
 from estimator.reference.drive import losses_of, model_of, run
 from testbed.channel.law import law_of
 from testbed.errors import UsageError
-from testbed.estimator.bounds import correlation_factor
 from testbed.estimator.registry import create
 
 HOLDING = [("aoe", {}), ("gpb", {"order": 0}), ("gpb", {"order": 2}), ("gpb1", {}), ("gpb2", {}), ("imm", {})]
+KINDS = (HIDDEN, FOUR)
 
 
-def _trial(seed: int, acks: str, steps: int = 6, lanes: int = 2, n: int = 2) -> Trial:
+def _trial(seed: int, acks: str, steps: int = 6, lanes: int = 2, n: int = 2, losses: str = HIDDEN) -> Trial:
     rng = np.random.default_rng([seed, ACKS.index(acks), 53])
-    return random_trial(rng, random_system(rng, n, 1, 1, HIDDEN), steps, lanes, acks)
+    return random_trial(rng, random_system(rng, n, 1, 1, losses), steps, lanes, acks)
 
 
 def _by_lane(trial: Trial, estimates: Callable[[int], list[gaussian.Estimate]]) -> tuple[Floats, Floats]:
@@ -55,20 +66,24 @@ def _defined(trial: Trial, kind: str, order: int = 0) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.parametrize("acks", ACKS)
-@pytest.mark.parametrize("seed", range(4))
-def test_gpb_of_order_k_is_the_exact_posterior(seed: int, acks: str) -> None:
-    trial = _trial(seed, acks, n=1 + seed % 2)
-    assert_same(run("gpb", trial, {"order": 6}), _enumerated(trial), 1e-9)
+@pytest.mark.parametrize("losses", KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_gpb_of_order_k_and_oe_are_the_exact_posterior(seed: int, losses: str, acks: str) -> None:
+    trial = _trial(seed, acks, steps=5, n=1 + seed % 2, losses=losses)
+    exact = _enumerated(trial)
+    assert_same(run("gpb", trial, {"order": 5}), exact, 1e-9)
+    assert_same(run("oe-exact", trial), exact, 1e-9)
+    assert_same(run("oe", trial), exact, 1e-8)
 
 
 @check(15)
-@given(trials(chains=(HIDDEN,), acks=("none", "subset"), steps=(1, 4), lanes=(1, 2)))
+@given(trials(chains=KINDS, acks=("none", "subset"), steps=(1, 4), lanes=(1, 2)))
 def test_gpb_of_order_d_is_exact_up_to_step_d_and_one(trial: Trial) -> None:
     assert_same(run("gpb", trial, {"order": trial.steps - 1}), _enumerated(trial), 1e-9)
 
 
 @check(40)
-@given(trials(chains=(HIDDEN,), steps=(1, 8)))
+@given(trials(chains=KINDS, steps=(1, 8)))
 def test_aoe_is_moment_matching_of_two_hypotheses(trial: Trial) -> None:
     """With the posterior of the hidden state; gpb of order 0 is the same."""
     reference = _defined(trial, "gpb", 0)
@@ -78,28 +93,30 @@ def test_aoe_is_moment_matching_of_two_hypotheses(trial: Trial) -> None:
 
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("acks", ["none", "late"])
+@pytest.mark.parametrize("losses", KINDS)
 @pytest.mark.parametrize("seed", range(3))
-def test_gpb_is_moment_matching_of_what_differs_in_older_bits(seed: int, acks: str, order: int) -> None:
-    trial = _trial(seed, acks, steps=8)
+def test_gpb_is_moment_matching_of_what_differs_in_older_bits(seed: int, losses: str, acks: str, order: int) -> None:
+    trial = _trial(seed, acks, steps=8, losses=losses)
     assert_same(run("gpb", trial, {"order": order}), _defined(trial, "gpb", order), 1e-9)
 
 
 @check(30)
-@given(trials(chains=(HIDDEN,), acks=("none", "subset"), steps=(1, 8), lanes=(1, 3)))
+@given(trials(chains=KINDS, acks=("none", "subset"), steps=(1, 8), lanes=(1, 3)))
 def test_imm_has_a_mode_for_each_state_and_fate(trial: Trial) -> None:
     assert_same(run("imm", trial), _defined(trial, "imm"), 1e-9)
 
 
 @check(20)
-@given(trials(chains=(HIDDEN,), acks=("all",), steps=(1, 10)))
+@given(trials(chains=KINDS, acks=("all",), steps=(1, 10)))
 def test_with_every_ack_all_are_kfio(trial: Trial) -> None:
     for kind, options in HOLDING:
         assert_same(run(kind, trial, options), run("kfio", trial), 1e-9)
 
 
+@pytest.mark.parametrize("losses", KINDS)
 @pytest.mark.parametrize("acks", ["none", "subset"])
-def test_many_particles_have_the_moments_of_the_posterior(acks: str) -> None:
-    trial = _trial(7, acks)
+def test_many_particles_have_the_moments_of_the_posterior(acks: str, losses: str) -> None:
+    trial = _trial(7, acks, steps=5, losses=losses)
     x_hat, P = run("pf", trial, {"particles": 60_000})
     exact_x, exact_P = _enumerated(trial)
     spread = np.sqrt(np.trace(exact_P, axis1=2, axis2=3))
@@ -153,7 +170,7 @@ def test_filters_for_independent_losses_refuse(kind: str) -> None:
 
 @check(40)
 @given(trials(chains=(HIDDEN,), steps=(6, 6), lanes=(1, 1)))
-def test_the_correlation_factor_covers_the_covariance_of_the_losses(trial: Trial) -> None:
+def test_the_covariance_factor_covers_the_covariance_of_the_losses(trial: Trial) -> None:
     """Row sums of |Cov(ν_i, ν_j)| over all histories are at most ¼ of it: Gershgorin's theorem does the rest."""
     system = trial.system
     histories = np.array(np.meshgrid(*[[0, 1]] * 6, indexing="ij")).reshape(6, -1)
@@ -161,6 +178,6 @@ def test_the_correlation_factor_covers_the_covariance_of_the_losses(trial: Trial
     assert priors.sum() == pytest.approx(1.0)
     away = histories - (histories @ priors)[:, None]
     covariance = (away * priors) @ away.T
-    factor = correlation_factor(losses_of(system))
+    factor = losses_of(system).covariance_factor
     assert factor is not None
     assert np.abs(covariance).sum(axis=1).max() <= 0.25 * factor + 1e-12

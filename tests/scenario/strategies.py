@@ -81,7 +81,7 @@ def inputs(draw: st.DrawFn, n: int, q: int, steps: int, estimators: list[str]) -
     return {"kind": kind, **draw(tables[kind])}
 
 
-losses: st.SearchStrategy[dict[str, Any]] = st.one_of(
+loss_laws: st.SearchStrategy[dict[str, Any]] = st.one_of(
     st.just({"kind": "none"}),
     st.fixed_dictionaries({"kind": st.just("bernoulli"), "arrival": probabilities}),
     st.fixed_dictionaries({"kind": st.just("bernoulli"), "loss": probabilities}),
@@ -94,6 +94,31 @@ losses: st.SearchStrategy[dict[str, Any]] = st.one_of(
         optional={"loss_good": st.floats(0, 0.3), "loss_bad": st.floats(0.3, 1), "start_good": probabilities},
     ),
     st.fixed_dictionaries({"kind": st.just("markov"), "loss": st.floats(0, 0.5), "mean_burst": st.floats(1, 1e6)}),
+    st.fixed_dictionaries(
+        {"kind": st.just("four-state"), "to_burst": st.floats(0, 0.5), "to_good": st.floats(0.01, 0.5)},
+        optional={
+            "to_pause": st.floats(0, 0.5),
+            "from_pause": st.floats(0.01, 1),
+            "to_isolated": st.floats(0, 0.5),
+            "start": st.sampled_from([[1.0, 0.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4]]),
+        },
+    ),
+)
+words = st.text("01", min_size=1, max_size=20)
+losses: st.SearchStrategy[dict[str, Any]] = st.one_of(
+    loss_laws,
+    st.fixed_dictionaries(
+        {"kind": st.just("trace"), "fates": words},
+        optional={"offset": st.just(0), "repeat": st.just(True), "assumed": loss_laws},
+    ),
+    st.fixed_dictionaries({"kind": st.just("scripted"), "pattern": words}, optional={"assumed": loss_laws}),
+    st.fixed_dictionaries(
+        {
+            "kind": st.just("scripted"),
+            "lost": st.lists(st.integers(0, 9) | st.sampled_from(["1-4", "3-3"]), min_size=1, max_size=4),
+        },
+        optional={"assumed": loss_laws},
+    ),
 )
 links = st.fixed_dictionaries({}, optional={"loss": losses})
 observation_links = st.fixed_dictionaries(

@@ -23,6 +23,7 @@ SYSTEM: dict[str, Any] = {
 }
 BASE: dict[str, Any] = {"system": SYSTEM, "estimators": [{"name": "oe"}]}
 ABSENT = object()
+KINDS = "none, bernoulli, markov, gilbert-elliott, four-state, trace, scripted"
 LOSS = "links.control.loss"
 _TO_GOOD = "Probability that a bad state is followed by a good one, 0 … 1"
 NAN, INF = float("nan"), float("inf")
@@ -142,16 +143,16 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     ({"links.control.on_loss": "noise"}, "links.control: unknown key 'on_loss'; did you mean 'loss'?"),
     # losses
-    ({f"{LOSS}.arrival": 0.5}, f"{LOSS}.kind: missing; allowed: none, bernoulli, markov, gilbert-elliott"),
+    ({f"{LOSS}.arrival": 0.5}, f"{LOSS}.kind: missing; allowed: {KINDS}"),
     (
         {f"{LOSS}.kind": "bernouli"},
-        f"{LOSS}.kind: got 'bernouli'; allowed: none, bernoulli, markov, gilbert-elliott; did you mean 'bernoulli'?",
+        f"{LOSS}.kind: got 'bernouli'; allowed: {KINDS}; did you mean 'bernoulli'?",
     ),
     (
         {LOSS: "bernoulli"},
-        f"{LOSS}: got 'bernoulli'; allowed: a table with a kind: none, bernoulli, markov, gilbert-elliott",
+        f"{LOSS}: got 'bernoulli'; allowed: a table with a kind: {KINDS}",
     ),
-    ({LOSS: {"kind": ["markov"]}}, f"{LOSS}.kind: got ['markov']; allowed: none, bernoulli, markov, gilbert-elliott"),
+    ({LOSS: {"kind": ["markov"]}}, f"{LOSS}.kind: got ['markov']; allowed: {KINDS}"),
     ({LOSS: {"kind": "bernoulli", "arival": 0.5}}, f"{LOSS}: unknown key 'arival'; did you mean 'arrival'?"),
     (
         {LOSS: {"kind": "bernoulli", "loss": 0.5, "arival": 0.5}},
@@ -205,9 +206,70 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {LOSS: {"kind": "gilbert", "to_bad": 0.1, "to_good": 0.5}},
-        f"{LOSS}.kind: got 'gilbert'; allowed: none, bernoulli, markov, gilbert-elliott; did you mean "
-        "'gilbert-elliott'?",
+        f"{LOSS}.kind: got 'gilbert'; allowed: {KINDS}; did you mean 'gilbert-elliott'?",
     ),
+    (
+        {LOSS: {"kind": "four-state", "to_burst": 0.7, "to_good": 0.5, "to_isolated": 0.4}},
+        f"{LOSS}.to_isolated: got 0.4; allowed with to_burst 0.7: 0 … 0.3, so that they add up to 1 at most",
+    ),
+    (
+        {LOSS: {"kind": "four-state", "to_burst": 0.7, "to_good": 0.5, "to_pause": 0.6}},
+        f"{LOSS}.to_pause: got 0.6; allowed with to_good 0.5: 0 … 0.5, so that they add up to 1 at most",
+    ),
+    (
+        {LOSS: {"kind": "four-state", "to_burst": 0, "to_good": 0.0, "to_isolated": 0.5}},
+        f"{LOSS}: got to_burst 0 and to_good 0; allowed: to_burst + to_good more than 0",
+    ),
+    (
+        {LOSS: {"kind": "four-state", "to_burst": 0.1, "to_good": 0.5, "from_pause": 0}},
+        f"{LOSS}.from_pause: got 0.0; allowed: more than 0, so that a pause ends",
+    ),
+    (
+        {LOSS: {"kind": "four-state", "to_burst": 0.1, "to_good": 0.5, "start": [0.5, 0.5]}},
+        f"{LOSS}.start: got [0.5, 0.5]; allowed: four numbers of 0 or more that add up to 1",
+    ),
+    (
+        {LOSS: {"kind": "four-state", "to_burst": 0.1, "to_good": 0.5, "p23": 0.5}},
+        f"{LOSS}: unknown key 'p23'; allowed: kind, to_burst, to_good, to_pause, from_pause, to_isolated, start",
+    ),
+    ({LOSS: {"kind": "trace"}}, f"{LOSS}: got neither of file and fates; allowed: exactly one of file, fates"),
+    ({LOSS: {"kind": "trace", "file": 3}}, f"{LOSS}.file: got 3; allowed: the path of a CSV file"),
+    ({LOSS: {"kind": "trace", "fates": "10x"}}, f"{LOSS}.fates: got '10x'; allowed: a text of 0 and 1"),
+    ({LOSS: {"kind": "trace", "fates": ""}}, f"{LOSS}.fates: got ''; allowed: a text of 0 and 1"),
+    (
+        {LOSS: {"kind": "trace", "fates": "1011", "offset": 4}},
+        f"{LOSS}.offset: got 4; allowed: 0 … 3, the last packet of the trace",
+    ),
+    (
+        {"steps": 9, LOSS: {"kind": "trace", "fates": "1011", "offset": 1, "repeat": False}},
+        f"{LOSS}.fates: got 3 packets from offset 1 on with repeat false; allowed: at least 9, one for each step, or "
+        "repeat = true",
+    ),
+    (
+        {LOSS: {"kind": "trace", "fates": "1011", "assumed": {"kind": "trace", "fates": "1"}}},
+        f"{LOSS}.assumed.kind: got 'trace'; allowed: none, bernoulli, markov, gilbert-elliott, four-state",
+    ),
+    (
+        {LOSS: {"kind": "scripted"}},
+        f"{LOSS}: got neither of lost and pattern; allowed: exactly one of lost, pattern",
+    ),
+    (
+        {LOSS: {"kind": "scripted", "lost": [1], "pattern": "01"}},
+        f"{LOSS}: got both of lost and pattern; allowed: exactly one of lost, pattern",
+    ),
+    (
+        {LOSS: {"kind": "scripted", "lost": []}},
+        f'{LOSS}.lost: got []; allowed: a list of packet numbers and ranges, such as [3, 4, "10-12"]',
+    ),
+    (
+        {LOSS: {"kind": "scripted", "lost": [3, "12-10"]}},
+        f"{LOSS}.lost[1]: got '12-10'; allowed: a number from 0, or a range such as \"10-12\"",
+    ),
+    (
+        {LOSS: {"kind": "scripted", "lost": [-1]}},
+        f'{LOSS}.lost[0]: got -1; allowed: a number from 0, or a range such as "10-12"',
+    ),
+    ({LOSS: {"kind": "scripted", "pattern": "1 0"}}, f"{LOSS}.pattern: got '1 0'; allowed: a text of 0 and 1"),
     (
         {"links.ack.loss": {"kind": "bernoulli", "arrival": 0.5}},
         "links.ack.loss: got kind 'bernoulli' with mode 'none'; allowed: only with mode 'link'",

@@ -28,12 +28,13 @@ def decoder(kind: str, sizes: Sizes = SIZES) -> Decoder[Message]:
     return Decoder(MESSAGES[kind], RUN, sizes)
 
 
-def shape_of(rule: ArrayRule, lanes: int, sizes: Sizes = SIZES) -> tuple[int, ...]:
-    return tuple(lanes if symbol == "lanes" else getattr(sizes, symbol) for symbol in rule.shape)
+def shape_of(rule: ArrayRule, lanes: int, sizes: Sizes = SIZES, late: int = 2) -> tuple[int, ...]:
+    free = {"lanes": lanes, "late": late}
+    return tuple(free[symbol] if symbol in free else getattr(sizes, symbol) for symbol in rule.shape)
 
 
-def values(rule: ArrayRule, lanes: int) -> st.SearchStrategy[NDArray[Any]]:
-    shape = shape_of(rule, lanes)
+def values(rule: ArrayRule, lanes: int, late: int) -> st.SearchStrategy[NDArray[Any]]:
+    shape = shape_of(rule, lanes, late=late)
     if rule.dtype == "|u1":
         return hnp.arrays(np.uint8, shape, elements=st.integers(0, 1))
     return hnp.arrays(np.float64, shape, elements=finite)
@@ -46,9 +47,19 @@ def packets(draw: st.DrawFn, kind: str) -> tuple[Packet, Arrays]:
     assert issubclass(model, Packet)
     lane = draw(st.integers(0, SIZES.lanes - 1))
     lanes = draw(st.integers(1, SIZES.lanes - lane))
-    present = [name for name, rule in model.ARRAYS.items() if rule.required or draw(st.booleans())]
-    arrays = {name: draw(values(model.ARRAYS[name], lanes)) for name in draw(st.permutations(present))}
-    if list(arrays) == ["mask"]:  # nothing arrived
+    step = draw(st.integers(model.FIRST_STEP, SIZES.steps - 1))
+    late_ones = [name for name in model.ARRAYS if name.startswith("late_")]
+    present = [
+        name for name, rule in model.ARRAYS.items() if name not in late_ones and (rule.required or draw(st.booleans()))
+    ]
+    earlier: list[int] = []
+    if late_ones and step > model.FIRST_STEP and draw(st.booleans()):
+        earlier = sorted(draw(st.sets(st.integers(model.FIRST_STEP, step - 1), min_size=1, max_size=3)))
+        present += late_ones
+    arrays = {name: draw(values(model.ARRAYS[name], lanes, len(earlier))) for name in draw(st.permutations(present))}
+    if earlier:
+        arrays["late_step"] = np.tile(np.array(earlier, dtype=np.float64), (lanes, 1))
+    if [name for name in arrays if name not in late_ones] == ["mask"]:  # nothing of this step arrived
         arrays["mask"] = np.zeros(lanes, dtype=np.uint8)
     header = model.model_validate(
         {
@@ -56,7 +67,7 @@ def packets(draw: st.DrawFn, kind: str) -> tuple[Packet, Arrays]:
             "run": RUN,
             "source": draw(names),
             "seq": draw(counts),
-            "step": draw(st.integers(1, SIZES.steps - 1)),
+            "step": step,
             "lane": lane,
             "lanes": lanes,
             "arrays": entries_of(arrays),

@@ -233,3 +233,48 @@ def test_a_header_that_is_not_padded_is_refused() -> None:
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8 + 4)
     assert reason(b"NCS1" + len(text).to_bytes(4, "little") + text + tail_of(arrays)) == "format"
+
+
+LATE: dict[str, Any] = {
+    "mask": np.array([1, 0, 1, 1], dtype=np.uint8),
+    "y": np.arange(4.0).reshape(4, 1),
+    "late_y": np.ones((4, 2, 1)),
+    "late_mask": np.ones((4, 2), dtype=np.uint8),
+    "late_step": np.tile([3.0, 5.0], (4, 1)),
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({}, None),
+        ({"late_step": np.tile([3.0, 7.0], (4, 1))}, "range"),
+        ({"late_step": np.tile([0.0, 5.0], (4, 1))}, "range"),
+        ({"late_step": np.tile([5.0, 3.0], (4, 1))}, "range"),
+        ({"late_step": np.tile([3.0, 3.0], (4, 1))}, "range"),
+        ({"late_step": np.tile([3.0, 4.5], (4, 1))}, "range"),
+        ({"late_step": np.array([[3.0, 5.0]] * 3 + [[3.0, 6.0]])}, "range"),
+        ({"late_mask": np.ones((4, 3), dtype=np.uint8)}, "shape"),
+        ({"late_mask": np.full((4, 2), 2, dtype=np.uint8)}, "mask"),
+        ({"late_y": None}, "arrays"),
+        ({"late_step": None}, "arrays"),
+        (
+            {"late_y": np.ones((4, 0, 1)), "late_mask": np.ones((4, 0), np.uint8), "late_step": np.ones((4, 0))},
+            "arrays",
+        ),
+    ],
+)
+def test_late_ones_are_of_earlier_steps_and_whole(changes: dict[str, Any], reason: str | None) -> None:
+    arrays = {name: array for name, array in {**LATE, **changes}.items() if array is not None}
+    header, _ = observation(
+        step=7, arrays=[[n, "<f8" if a.dtype == float else "|u1", a.shape] for n, a in arrays.items()]
+    )
+    payload = payload_of(header, tail_of(arrays))
+    reader = decoder("observation")
+    for _ in range(2):  # the second time the header is known
+        if reason is None:
+            assert reader.decode(payload)[1].keys() == arrays.keys()
+        else:
+            with pytest.raises(Rejected) as refusal:
+                reader.decode(payload)
+            assert refusal.value.reason == reason

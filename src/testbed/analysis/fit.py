@@ -8,13 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
+from testbed.analysis import fit_four_state as four_state
+from testbed.analysis import fit_gilbert_elliott as gilbert_elliott
 from testbed.analysis.fit_chains import chain_log_likelihood, fit_bernoulli, fit_markov, transitions
-from testbed.analysis.fit_gilbert_elliott import NAMES, fit_gilbert_elliott, parameters
 from testbed.analysis.fit_goodness import Goodness, goodness
 from testbed.analysis.fit_intervals import Interval, chain_loss, wilson
+from testbed.analysis.fit_search import Found
+from testbed.channel.hidden import Hidden
 from testbed.channel.law import LossModel
 from testbed.errors import UsageError
-from testbed.numerics.lanes import Bools
+from testbed.numerics.lanes import Bools, Floats
 
 PACKETS_MIN = 20
 _DIGITS = 6
@@ -69,7 +72,7 @@ class Fit:
 
 
 def fit_losses(fates: Bools) -> Fit:
-    """Fit Bernoulli, Markov and Gilbert–Elliott losses, each stationary at the first packet.
+    """Fit Bernoulli, Markov, Gilbert–Elliott and four-state losses, each stationary at the first packet.
 
     fates: (n,), in the order of sending, True where a packet arrived. Raises UsageError for fewer than PACKETS_MIN
     packets, and where none or all were lost: then it says what that tells of the rate.
@@ -83,7 +86,7 @@ def fit_losses(fates: Bools) -> Fit:
             f"{share} of {number} packets lost: nothing to fit; allowed: some lost, some not; the {rate} rate is at "
             f"most {3 / number:.3g} with 95 % confidence if losses are independent (rule of three)"
         )
-    models = (_bernoulli(fates, lost), _markov(fates, lost), _gilbert_elliott(fates))
+    models = (_bernoulli(fates, lost), _markov(fates, lost), _gilbert_elliott(fates), _four_state(fates))
     chosen = min(models, key=lambda model: model.bic)
     return Fit(number, lost, models, _ratios(*models), chosen.kind)
 
@@ -105,15 +108,25 @@ def _markov(fates: Bools, lost: int) -> Fitted:
 
 
 def _gilbert_elliott(fates: Bools) -> Fitted:
-    found = fit_gilbert_elliott(fates)
-    values = [float(value) for value in parameters(found.losses)]
+    found = gilbert_elliott.fit_gilbert_elliott(fates)
+    values = gilbert_elliott.parameters(found.losses)
+    return _hidden("gilbert-elliott", fates, found, gilbert_elliott.NAMES, values)
+
+
+def _four_state(fates: Bools) -> Fitted:
+    found = four_state.fit_four_state(fates)
+    values = four_state.parameters(found.losses)
+    return _hidden("four-state", fates, found, four_state.NAMES, values)
+
+
+def _hidden(kind: str, fates: Bools, found: Found[Hidden], names: tuple[str, ...], values: Floats) -> Fitted:
     why = found.obstacle or "at the boundary, held there for the others"
     given = tuple(
-        Parameter(name, value, interval, why if interval is None else "")
-        for name, value, interval in zip(NAMES, values, found.intervals, strict=True)
+        Parameter(name, float(value), interval, why if interval is None else "")
+        for name, value, interval in zip(names, values, found.intervals, strict=True)
     )
     loss = Parameter("loss", 1.0 - found.losses.arrival, found.loss_interval, "" if found.loss_interval else why)
-    return _fitted("gilbert-elliott", fates, found.losses, given, loss, found.log_likelihood)
+    return _fitted(kind, fates, found.losses, given, loss, found.log_likelihood)
 
 
 def _fitted(
@@ -126,11 +139,14 @@ def _fitted(
 
 
 def _toml(kind: str, given: tuple[Parameter, ...]) -> str:
-    values = ", ".join(f"{p.name} = {float(f'{p.value:.{_DIGITS}g}')!r}" for p in given)
-    return f'loss = {{ kind = "{kind}", {values} }}'
+    values = {p.name: float(f"{p.value:.{_DIGITS}g}") for p in given}
+    if values.get("to_good", 0.0) + values.get("to_pause", 0.0) > 1.0:  # by rounding; a scenario refuses it
+        values["to_pause"] = 1.0 - values["to_good"]
+    listed = ", ".join(f"{name} = {value!r}" for name, value in values.items())
+    return f'loss = {{ kind = "{kind}", {listed} }}'
 
 
-def _ratios(bernoulli: Fitted, markov: Fitted, full: Fitted) -> tuple[Ratio, ...]:
+def _ratios(bernoulli: Fitted, markov: Fitted, full: Fitted, four: Fitted) -> tuple[Ratio, ...]:
     """Of two models on the boundary of the larger one the law is a mixture of χ² with fewer degrees of freedom.
 
     S. G. Self, K.-Y. Liang: Asymptotic properties of maximum likelihood estimators and likelihood ratio tests under
@@ -140,6 +156,7 @@ def _ratios(bernoulli: Fitted, markov: Fitted, full: Fitted) -> tuple[Ratio, ...
         _ratio(bernoulli, markov, 1, True, ""),
         _ratio(markov, full, 2, True, "at most this: loss_good = 0 and loss_bad = 1 lie on the boundary"),
         _ratio(bernoulli, full, 3, False, "no χ² law: with independent losses the states cannot be told"),
+        _ratio(markov, four, 3, False, "no χ² law: without pauses from_pause means nothing"),
     )
 
 

@@ -1,20 +1,15 @@
-"""Maximum likelihood for the Gilbert–Elliott channel: EM from several starting points, then a quasi-Newton search.
-
-The gradient comes from the E step too (Fisher's identity), and the information from differences of the gradient.
-"""
+"""Maximum likelihood for the Gilbert–Elliott channel: EM from several starting points, then a quasi-Newton search."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.special import chdtri, expit, logit
+from scipy.special import chdtri
 
 from testbed.analysis.fit_chains import chain_log_likelihood, fit_bernoulli, fit_markov, stationary_rates
 from testbed.analysis.fit_intervals import Interval, around
+from testbed.analysis.fit_search import Certainty, Coordinates, Found, at_boundary, climbed
 from testbed.analysis.fit_states import Expected, Fates
 from testbed.channel.gilbert_elliott import GilbertElliott
 from testbed.numerics.lanes import Bools, Floats
@@ -22,30 +17,11 @@ from testbed.numerics.lanes import Bools, Floats
 NAMES = ("to_bad", "to_good", "loss_good", "loss_bad")
 EM_STEPS = 8
 _BEST = 3  # starting points that are followed to the end
-_LOGIT_MAX = 14.0
-_SAME = 1e-6  # of the log-likelihood: what a parameter at 0 or 1 may cost
 _INDEPENDENT = float(chdtri(3, 0.05))  # gain in 2 log of the likelihood by three parameters that says nothing
 _NONE = (None,) * len(NAMES)
-_STEP = 1e-4  # in the logits
-_SINGULAR = 1e-4  # least eigenvalue of the information, scaled to ones on its diagonal
 
 
-@dataclass(frozen=True)
-class Found:
-    """The channel of largest likelihood. ``intervals`` of NAMES and of the stationary loss.
-
-    Those of parameters at 0 and 1 are None, and the others are for these held there. Where the parameters cannot be
-    told from the fates, ``obstacle`` says why, and there are no intervals at all.
-    """
-
-    losses: GilbertElliott
-    log_likelihood: float
-    intervals: tuple[Interval | None, ...]
-    loss_interval: Interval | None
-    obstacle: str = ""
-
-
-def fit_gilbert_elliott(fates: Bools) -> Found:
+def fit_gilbert_elliott(fates: Bools) -> Found[GilbertElliott]:
     """Of all channels with loss_good ≤ loss_bad; fates: (n,), True where a packet arrived, both kinds among them."""
     seen = Fates(fates)
     begun = []
@@ -55,8 +31,8 @@ def fit_gilbert_elliott(fates: Bools) -> Found:
     begun.sort(key=lambda pair: pair[0], reverse=True)
     chain = fit_markov(fates)
     simple = GilbertElliott(chain, 0.0, 1.0)
-    ends = [simple, *(_climbed(seen, losses) for _, losses in begun[:_BEST])]
-    losses = _at_the_boundary(seen, _ordered(max(ends, key=seen.log_likelihood)))
+    ends = [simple, *(climbed(seen, _BY, losses) for _, losses in begun[:_BEST])]
+    losses = at_boundary(seen, _BY, _ordered(max(ends, key=seen.log_likelihood)), _ENDS)
     reached = seen.log_likelihood(losses)
     if 2.0 * (reached - chain_log_likelihood(fates, fit_bernoulli(fates))) < _INDEPENDENT:
         return Found(losses, reached, _NONE, None, "not identifiable: hardly likelier than independent losses")
@@ -123,25 +99,8 @@ def score(losses: GilbertElliott, expected: Expected) -> Floats:
     )
 
 
-def _climbed(seen: Fates, losses: GilbertElliott) -> GilbertElliott:
-    """Where a search in the logits ends."""
-
-    def fallen(logits: np.ndarray[tuple[int], np.dtype[np.float64]]) -> tuple[float, Floats]:
-        at = _channel(expit(logits))
-        expected = seen.expected(at)
-        number = expected.moves.sum()
-        return -expected.log_likelihood / number, -score(at, expected) / number
-
-    start = np.clip(logit(np.clip(parameters(losses), 1e-9, 1.0 - 1e-9)), -_LOGIT_MAX, _LOGIT_MAX)
-    end = minimize(
-        fallen,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[(-_LOGIT_MAX, _LOGIT_MAX)] * 4,
-        options={"maxiter": 150, "ftol": 1e-15, "gtol": 1e-9},
-    )
-    return _channel(expit(end.x))
+_BY = Coordinates(_channel, parameters, score)
+_ENDS = ((2, 0.0), (3, 1.0), (0, 1.0), (1, 1.0))
 
 
 def _ordered(losses: GilbertElliott) -> GilbertElliott:
@@ -152,58 +111,14 @@ def _ordered(losses: GilbertElliott) -> GilbertElliott:
     return GilbertElliott.of(states.recovery, states.failure, losses.loss_bad, losses.loss_good)
 
 
-def _at_the_boundary(seen: Fates, losses: GilbertElliott) -> GilbertElliott:
-    """With parameters at exactly 0 or 1 where that costs nothing."""
-    reached = seen.log_likelihood(losses)
-    for index, value in ((2, 0.0), (3, 1.0), (0, 1.0), (1, 1.0)):
-        moved = parameters(losses)
-        if moved[index] == value or abs(moved[index] - value) > 0.01:
-            continue
-        moved[index] = value
-        candidate = _channel(moved)
-        if seen.log_likelihood(candidate) >= reached - _SAME:
-            losses = candidate
-    return losses
-
-
-def _with_intervals(seen: Fates, losses: GilbertElliott) -> Found:
+def _with_intervals(seen: Fates, losses: GilbertElliott) -> Found[GilbertElliott]:
     """Wald's in the logits of the parameters within (0, 1), the others held."""
-    reached, values = seen.log_likelihood(losses), parameters(losses)
-    free = np.flatnonzero((values > 0.0) & (values < 1.0))
-    if not free.size:
+    reached, found = seen.log_likelihood(losses), Certainty.of(seen, _BY, losses)
+    if not found.free.size:
         return Found(losses, reached, _NONE, None)
-    curvature = _differences(lambda at: score(at, seen.expected(at))[free], values, free)
-    covariance = _inverse(-0.5 * (curvature + curvature.T))
-    if covariance is None:
+    if found.covariance is None:
         return Found(losses, reached, _NONE, None, "not identifiable: the information is singular")
-    intervals: list[Interval | None] = [None] * 4
-    for index, variance in zip(free, np.diag(covariance), strict=True):
-        intervals[index] = around(float(values[index]), float(np.sqrt(variance)))
-    slope = _differences(lambda at: np.array([logit(1.0 - at.arrival)]), values, free)[:, 0]
-    loss = around(1.0 - losses.arrival, float(np.sqrt(slope @ covariance @ slope)))
-    return Found(losses, reached, tuple(intervals), loss)
-
-
-def _differences(function: Callable[[GilbertElliott], Floats], values: Floats, free: NDArray[np.intp]) -> Floats:
-    """(free, outputs): central differences of a function of the channel in the logits of its free parameters."""
-    rows = []
-    for index in free:
-        ends = []
-        for step in (_STEP, -_STEP):
-            moved = values.copy()
-            moved[index] = expit(logit(values[index]) + step)
-            ends.append(function(_channel(moved)))
-        rows.append((ends[0] - ends[1]) / (2.0 * _STEP))
-    return np.array(rows)
-
-
-def _inverse(information: Floats) -> Floats | None:
-    """None where the matrix is not clearly positive definite."""
-    diagonal = np.diag(information)
-    if not np.all(diagonal > 0.0):
-        return None
-    scale = 1.0 / np.sqrt(diagonal)
-    scaled = information * np.outer(scale, scale)
-    if np.linalg.eigvalsh(scaled)[0] < _SINGULAR:
-        return None
-    return np.asarray(np.linalg.inv(scaled) * np.outer(scale, scale), dtype=np.float64)
+    intervals: list[Interval | None] = [None] * len(NAMES)
+    for index, variance in zip(found.free, np.diag(found.covariance), strict=True):
+        intervals[index] = around(float(parameters(losses)[index]), float(np.sqrt(variance)))
+    return Found(losses, reached, tuple(intervals), found.interval(lambda at: 1.0 - at.arrival))

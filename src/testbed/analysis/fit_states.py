@@ -1,4 +1,4 @@
-"""What the fates of a link tell of the hidden states of a Gilbert–Elliott channel: the E step of Baum and Welch.
+"""What the fates of a link tell of two hidden states behind them: the E step of Baum and Welch.
 
 L. E. Baum, T. Petrie, G. Soules, N. Weiss: A maximization technique occurring in the statistical analysis of
 probabilistic functions of Markov chains. Ann. Math. Statist. 41 (1970) 164–171.
@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from testbed.channel.gilbert_elliott import GilbertElliott
 from testbed.numerics.lanes import Bools, Floats
 
-_LOST, _ARRIVED, _PADDING = 0, 1, 2
-
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Given the fates: their log-likelihood, and expected counts. State 0 is bad, 1 good.
+    """Given the fates: their log-likelihood, and expected counts.
 
-    moves (2, 2, 2): packets of a fate (0 lost) that met the first state and left it for the second.
-    first (2,): probability of the state that the first packet met.
+    moves (kinds, 2, 2): how often, at a symbol, the first state was met and left for the second. For Gilbert–Elliott
+    the symbols are the fates (0 lost), and state 0 is bad, 1 good. first (2,): probability of the first state.
     """
 
     log_likelihood: float
@@ -31,52 +29,59 @@ class Expected:
     first: Floats
 
 
-class Fates:
-    """The fates (n,), True where a packet arrived, cut into about √n blocks that are worked on side by side."""
+class Blocks:
+    """A row of symbols (n,), 0 … kinds − 1, cut into about √n blocks that are worked on side by side.
 
-    def __init__(self, fates: Bools) -> None:
-        length = max(1, math.isqrt(len(fates)))
-        blocks = -(-len(fates) // length)
-        padded = np.full(length * blocks, _PADDING, dtype=np.intp)
-        padded[: len(fates)] = fates
+    With a matrix M_s (2, 2) for each symbol, P(all) = start M_{s_0} M_{s_1} … 1.
+    """
+
+    def __init__(self, symbols: NDArray[np.intp], kinds: int) -> None:
+        length = max(1, math.isqrt(len(symbols)))
+        blocks = -(-len(symbols) // length)
+        padded = np.full(length * blocks, kinds, dtype=np.intp)
+        padded[: len(symbols)] = symbols
         self._steps: NDArray[np.intp] = np.ascontiguousarray(padded.reshape(blocks, length).T)
+        self._kinds = kinds
 
-    def expected(self, losses: GilbertElliott) -> Expected:
-        """Forwards and backwards, scaled at each packet. The channel is stationary at the first one.
-
-        With M_f = diag(P(f | state)) · transition, the likelihood is π M_{f_0} M_{f_1} … 1.
-        """
-        start, matrices = _start(losses), _matrices(losses)
-        steps = matrices[self._steps]
+    def expected(self, start: Floats, matrices: Floats) -> Expected:
+        """Forwards and backwards, scaled at each symbol. start (2,), matrices (kinds, 2, 2)."""
+        steps = np.concatenate([matrices, np.eye(2)[None]])[self._steps]
         products = _products(steps)
         forward, log_likelihood = _forward(start, steps, products)
         backward = _backward(steps, products)
-        moves = np.empty((2, 2, 2))
-        for fate in (_LOST, _ARRIVED):
-            before, after = forward[self._steps == fate], backward[self._steps == fate]
-            weight = np.einsum("ks,st,kt->k", before, matrices[fate], after)
-            moves[fate] = matrices[fate] * ((before / weight[:, None]).T @ after)
+        moves = np.empty((self._kinds, 2, 2))
+        for symbol in range(self._kinds):
+            before, after = forward[self._steps == symbol], backward[self._steps == symbol]
+            weight = np.einsum("ks,st,kt->k", before, matrices[symbol], after)
+            moves[symbol] = matrices[symbol] * ((before / weight[:, None]).T @ after)
         first = start * (steps[0, 0] @ backward[0, 0])
         return Expected(log_likelihood, moves, first / first.sum())
 
+    def log_likelihood(self, start: Floats, matrices: Floats) -> float:
+        """log P(all)."""
+        steps = np.concatenate([matrices, np.eye(2)[None]])[self._steps]
+        return _forward(start, steps, _products(steps))[1]
+
+
+class Fates:
+    """The fates (n,), True where a packet arrived, as a Gilbert–Elliott channel gives them, stationary at the first."""
+
+    def __init__(self, fates: Bools) -> None:
+        self._blocks = Blocks(fates.astype(np.intp), 2)
+
+    def expected(self, losses: GilbertElliott) -> Expected:
+        """With M_f = diag(P(f | state)) · transition."""
+        return self._blocks.expected(losses.stationary, _matrices(losses))
+
     def log_likelihood(self, losses: GilbertElliott) -> float:
         """log P(fates)."""
-        steps = _matrices(losses)[self._steps]
-        return _forward(_start(losses), steps, _products(steps))[1]
-
-
-def _start(losses: GilbertElliott) -> Floats:
-    """The stationary law of the states."""
-    good = losses.states.arrival
-    return np.array([1.0 - good, good])
+        return self._blocks.log_likelihood(losses.stationary, _matrices(losses))
 
 
 def _matrices(losses: GilbertElliott) -> Floats:
-    """M of a lost packet, of one that arrived, and of none."""
-    states = losses.states
-    move = np.array([[1.0 - states.recovery, states.recovery], [states.failure, 1.0 - states.failure]])
-    loss = np.array([losses.loss_bad, losses.loss_good])[:, None]
-    return np.array([loss * move, (1.0 - loss) * move, np.eye(2)])
+    """M of a lost packet, and of one that arrived."""
+    loss = losses.loss[:, None]
+    return np.array([loss * losses.transition, (1.0 - loss) * losses.transition])
 
 
 def _products(steps: Floats) -> Floats:

@@ -45,7 +45,7 @@ def robust_figures(scenario: Scenario) -> list[dict[str, Any]] | None:
             recursion = RobustRecursion.of(model, made.weight)
             chain = model.observation.as_chain
             if chain is None:
-                reason = "R is about independent and Markov arrivals, not Gilbert–Elliott ones"
+                reason = "R is about independent and Markov arrivals, not ones with a hidden state"
                 out.append({**entry, **_NOTHING, **_answer(None, "R Theorem 5", reason)})
             else:
                 out.append({**entry, **_figures(recursion, chain, model.P0)})

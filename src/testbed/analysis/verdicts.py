@@ -17,7 +17,7 @@ from testbed.analysis.robust_verdicts import robust_figures
 from testbed.analysis.strong import StrongObservability, strong_observability
 from testbed.analysis.structure import Reach, controllability, observability, unstable_eigenvalues
 from testbed.channel.chains import chain_of
-from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.hidden import Hidden
 from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain
 from testbed.numerics.lanes import Floats
@@ -154,8 +154,8 @@ def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
 
 
 def _simplest(losses: LossModel) -> LossModel:
-    """The chain of arrivals that a Gilbert–Elliott channel is, if it is one: then the theorems for chains hold."""
-    return (losses.as_chain or losses) if isinstance(losses, GilbertElliott) else losses
+    """The chain of arrivals that the losses are, if they are one: then the theorems for chains hold."""
+    return losses.as_chain or losses
 
 
 def observation_verdict(facts: Facts, chain: LossModel) -> Verdict:
@@ -173,7 +173,7 @@ def observation_verdict(facts: Facts, chain: LossModel) -> Verdict:
         return Verdict(None, "none", "no losses, but the noise does not reach all that grows")
     if not facts.noise_feeds_growth:
         return Verdict(None, "none", "(A, sqrt Q) is not stabilisable: no theorem here applies")
-    if isinstance(chain, GilbertElliott):
+    if isinstance(chain, Hidden):
         return hidden_verdict(facts, chain)
     threshold = recovery_threshold(facts.A)
     growth = f"ρ²(1 − recovery) = {facts.growth(chain):.6g}"
@@ -198,7 +198,7 @@ def observation_verdict(facts: Facts, chain: LossModel) -> Verdict:
     return Verdict(None, "none", f"{below}: {why}; {facts.strong.reason}")
 
 
-def hidden_verdict(facts: Facts, losses: GilbertElliott) -> Verdict:
+def hidden_verdict(facts: Facts, losses: Hidden) -> Verdict:
     """The same for a hidden chain behind the arrivals, where the system is detectable and the noise feeds its growth.
 
     Necessary: E[P̄_k] ≥ Σ_m P(the last m packets lost) A^m Q A'^m, and that probability falls like θ^m. Sufficient: if
@@ -229,9 +229,9 @@ def control_verdict(observation: Verdict, chain: LossModel, source: Input | None
         known = "there is no input" if source is None else "the fate of every control packet is known"
         return Verdict(observation.stable, "separation", f"{known}: as with the observation link alone")
     theorem = "D Theorem 2" if chain.independent else "M Theorem 4"
-    if isinstance(chain, GilbertElliott):
+    if isinstance(chain, Hidden):
         theorem = "S, correlated"
-        if abs(chain.memory) == 1.0:
+        if chain.covariance_factor is None:
             return Verdict(
                 False if observation.stable is False else None, theorem, "the states alternate: S is not bounded"
             )
@@ -255,7 +255,7 @@ def peak_figures(facts: Facts, chain: LossModel) -> dict[str, Any]:
     """P Theorem 6, and Theorem 8 for scalar systems."""
     out: dict[str, Any] = dict.fromkeys(("condition_i", "condition_ii", "left_side", "d", "series", "series_tail"))
     out |= {"failure_max": None, "critical_recovery": recovery_threshold(facts.A)}
-    if isinstance(chain, GilbertElliott):
+    if isinstance(chain, Hidden):
         return {**out, **Verdict(None, "none", "P is for Markov arrivals, and these have a hidden state").table()}
     if not facts.observable.full:
         return {**out, **Verdict(None, "P Theorem 6", "(A, C) is not observable").table()}
@@ -327,9 +327,9 @@ def _equal(a: float, b: float) -> bool:
 
 def _link(loss: Loss, losses: LossModel) -> dict[str, Any]:
     """The figures of a link's losses; lengths that are infinite, or of what never comes, are None."""
-    hidden = isinstance(losses, GilbertElliott)
-    bad = run_law(losses, False) if isinstance(losses, GilbertElliott) else lost_run(losses)
-    good = run_law(losses, True) if isinstance(losses, GilbertElliott) else delivered_run(losses)
+    hidden = isinstance(losses, Hidden)
+    bad = run_law(losses, False) if isinstance(losses, Hidden) else lost_run(losses)
+    good = run_law(losses, True) if isinstance(losses, Hidden) else delivered_run(losses)
     if losses.never_loses:
         bad = None
     return {
@@ -341,7 +341,7 @@ def _link(loss: Loss, losses: LossModel) -> dict[str, Any]:
         "burst_99": bad.quantile(0.99) if bad is not None else None,
         "mean_good_run": good.mean if good is not None else None,
         "burst_decay": losses.burst_decay,
-        "correlation": losses.coupling * losses.memory,
+        "correlation": losses.correlation,
         "memory": losses.memory,
     }
 

@@ -29,7 +29,7 @@ def four_state(
     start: law of the first state; None: what the chain that is once in the good state tends to.
     """
     moves = (
-        (1.0 - to_burst - to_isolated, 0.0, to_burst, to_isolated),
+        (max(0.0, 1.0 - to_burst - to_isolated), 0.0, to_burst, to_isolated),
         (0.0, 1.0 - from_pause, from_pause, 0.0),
         (to_good, to_pause, max(0.0, 1.0 - to_good - to_pause), 0.0),
         (1.0, 0.0, 0.0, 0.0),

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
+
+from testbed.channel.hidden import Hidden
 from testbed.channel.loss import Chain, LossProcess
-from testbed.errors import UsageError
 from testbed.numerics.chances import happens
-from testbed.numerics.lanes import Mask
+from testbed.numerics.lanes import Floats, Mask
 from testbed.numerics.streams import Stream
 
 
 @dataclass(frozen=True)
-class GilbertElliott:
-    """A packet is lost with the probability of the state that it meets; then the state moves, once a packet.
+class GilbertElliott(Hidden):
+    """Two states, bad and good, in this order where they are counted.
 
     states: the chain of the states, 1 = good, that is Chain(P(bad→good), P(good→bad), P(first state good)).
     loss_good, loss_bad: probability of a loss in each state.
@@ -36,32 +39,24 @@ class GilbertElliott:
         """Stationary at the first packet unless ``start_good`` is given."""
         return cls(Chain.markov(to_good, to_bad, start_good), loss_good, loss_bad)
 
-    @property
-    def recovery(self) -> float:
-        """That of ``as_chain``. Raises UsageError where there is none."""
-        return self._chain().recovery
+    @cached_property
+    def initial(self) -> Floats:
+        return np.array([1.0 - self.states.start, self.states.start])
 
-    @property
-    def failure(self) -> float:
-        """That of ``as_chain``. Raises UsageError where there is none."""
-        return self._chain().failure
+    @cached_property
+    def transition(self) -> Floats:
+        states = self.states
+        return np.array([[1.0 - states.recovery, states.recovery], [states.failure, 1.0 - states.failure]])
 
-    @property
-    def start(self) -> float:
-        """That of ``as_chain``. Raises UsageError where there is none."""
-        return self._chain().start
+    @cached_property
+    def loss(self) -> Floats:
+        return np.array([self.loss_bad, self.loss_good])
 
-    @property
-    def never_loses(self) -> bool:
-        chain = self.as_chain
-        return chain is not None and chain.never_loses
+    @cached_property
+    def stationary(self) -> Floats:
+        return np.array([1.0 - self.states.arrival, self.states.arrival])
 
-    @property
-    def independent(self) -> bool:
-        """True when arrivals are independent and identically distributed."""
-        return self.as_chain is not None and self.as_chain.independent
-
-    @property
+    @cached_property
     def as_chain(self) -> Chain | None:
         """The same process as a chain of arrivals; None where it is none."""
         states = self.states
@@ -88,15 +83,6 @@ class GilbertElliott:
         return 1.0 - self._mixed(self.states.arrival)
 
     @property
-    def mean_burst(self) -> float | None:
-        """Mean length of a run of losses: losses a packet over bursts a packet. None if there is no such run."""
-        good, bad = self.states.arrival, 1.0 - self.states.arrival
-        after_good = self._mixed(1.0 - self.states.failure)
-        after_bad = self._mixed(self.states.recovery)
-        begins = good * (1.0 - self.loss_good) * after_good + bad * (1.0 - self.loss_bad) * after_bad
-        return (1.0 - self.arrival) / begins if begins > 0.0 else None
-
-    @property
     def memory(self) -> float:
         """r of Corr(γ_0, γ_j) = coupling · r^j, in the stationary law."""
         return self.states.memory
@@ -111,6 +97,15 @@ class GilbertElliott:
         """What the state tells of the fate: Corr(γ_0, γ_j) = coupling · memory^j for j = 1, 2, …"""
         good, spread = self.states.arrival, self.arrival * (1.0 - self.arrival)
         return self.contrast**2 * good * (1.0 - good) / spread if spread > 0.0 else 0.0
+
+    @property
+    def correlation(self) -> float:
+        return self.coupling * self.memory
+
+    @property
+    def covariance_factor(self) -> float | None:
+        r = 0.0 if self.independent or self.never_loses else abs(self.memory)
+        return 1.0 + 2.0 * self.contrast**2 * r / (1.0 - r) if r < 1.0 else None
 
     @property
     def burst_decay(self) -> float:
@@ -140,19 +135,11 @@ class GilbertElliott:
         """P(loss) where the state is good with this probability."""
         return good * self.loss_good + (1.0 - good) * self.loss_bad
 
-    def _chain(self) -> Chain:
-        """For what holds for chains of arrivals alone, so that it is not silently wrong here."""
-        chain = self.as_chain
-        if chain is None:
-            raise UsageError(
-                "Gilbert-Elliott losses have no recovery and failure rate, and this holds for Markov losses only; "
-                "allowed here: none, bernoulli, markov, or gilbert-elliott with loss_good = 0 and loss_bad = 1"
-            )
-        return chain
-
 
 class GilbertElliottProcess:
     """Draws the fate of packet 0, 1, 2, … for a block of lanes: the moves of the state and the drops apart."""
+
+    states = 2
 
     def __init__(self, losses: GilbertElliott, states: Stream, drops: Stream, lanes: int) -> None:
         self._states = LossProcess(losses.states, states, lanes)

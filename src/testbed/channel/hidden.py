@@ -8,14 +8,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from testbed.channel.loss import Chain
 from testbed.errors import UsageError
-from testbed.numerics.lanes import Floats
+from testbed.numerics.lanes import Floats, Mask
 from testbed.numerics.markov import long_run, mixing_sums, reached, summed_ranges
+from testbed.numerics.streams import Stream
 
+State: TypeAlias = Any  # int | NDArray[np.intp]
 _SAME = 1e-15
 
 
@@ -130,7 +133,7 @@ class Hidden(ABC):
 
     @property
     def worst_loss(self) -> float:
-        """A bound of the limsup of P(packet k is lost | the fates before it), over all fates: that for a known state."""
+        """A bound of the limsup of P(packet k is lost | the fates before it), over all fates: for a known state."""
         return float((self.transition @ self.loss)[self.stationary > 0.0].max())
 
     @property
@@ -143,7 +146,7 @@ class Hidden(ABC):
             return 1.0
         here = reached(self.initial > 0.0, self.transition)
         arrives = 1.0 - self.loss[here]
-        ahead = summed_ranges(self.transition[np.ix_(here, here)], arrives)
+        ahead = summed_ranges(self.transition[np.ix_(here, here)], self.stationary[here], arrives)
         return None if ahead is None else 1.0 + 2.0 * float(np.ptp(arrives)) * ahead
 
     def share_moments(self, packets: int) -> tuple[float, float]:
@@ -185,3 +188,42 @@ class HiddenChain(Hidden):
     @cached_property
     def loss(self) -> Floats:
         return np.array(self.losses)
+
+
+class HiddenProcess:
+    """Draws the fate of packet 0, 1, 2, … for a block of lanes: the moves of the state and the drops apart.
+
+    A state is the number of its row, an ``int`` for one lane, else an array (M,). It is drawn by where a uniform number
+    lies on the probabilities of the states, side by side in their order.
+    """
+
+    def __init__(self, losses: HiddenChain, states: Stream, drops: Stream, lanes: int) -> None:
+        self._states, self._drops, self._lanes = states, drops, lanes
+        self._first = np.cumsum(losses.initial)[:-1]
+        self._next = np.cumsum(losses.transition, axis=1)[:, :-1]
+        self._ends = [ends.tolist() for ends in self._next]
+        self._arrival = 1.0 - losses.loss
+        self._drawn = bool(((losses.loss > 0.0) & (losses.loss < 1.0)).any())
+        self.states = len(losses.losses)
+        self.state: State | None = None
+
+    def next(self, number: int) -> Mask:
+        """Arrival mask of packet ``number``: a ``bool`` for one lane, else a boolean array of shape (M,)."""
+        return self.fate(number, self.move(number))
+
+    def move(self, number: int) -> State:
+        """State ``number``, from the one before."""
+        (point,) = self._states.uniforms(number)
+        if self._lanes == 1:
+            ends = self._first if self.state is None else self._ends[self.state]
+            self.state = sum(point >= end for end in ends)
+        else:
+            ends = self._first if self.state is None else self._next[self.state]
+            self.state = (np.asarray(point)[:, None] >= ends).sum(axis=1)
+        return self.state
+
+    def fate(self, number: int, state: State) -> Mask:
+        """The fate of packet ``number`` in that state."""
+        arrival = self._arrival[state]
+        (point,) = self._drops.uniforms(number) if self._drawn else (0.5,)
+        return bool(point < arrival) if self._lanes == 1 else np.asarray(point < arrival)

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.hidden import Hidden
 from testbed.channel.loss import Chain
+from testbed.numerics.markov import reached
 
-LossModel = Chain | GilbertElliott
-"""What a link's losses can be; both have never_loses, independent, first_arrival, arrival, mean_burst, memory,
-coupling and burst_decay."""
+LossModel = Chain | Hidden
+"""What estimators and theorems take a link's losses for. Both have as_chain, never_loses, independent, first_arrival,
+arrival, mean_burst, correlation, memory, burst_decay, covariance_factor and share_moments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,41 +45,36 @@ class Law:
 def law_of(losses: LossModel) -> Law:
     """The law of least states. Of a chain: state 0 lost, state 1 delivered.
 
-    Of a Gilbert–Elliott channel: (bad, lost), (good, lost), (bad, delivered), (good, delivered), less those that cannot
-    happen; where it is a chain of arrivals, the law of that.
+    Of losses with hidden states: (state, lost) for each of them, then (state, delivered), less those that cannot
+    happen; where they are a chain of arrivals, the law of that.
     """
-    if isinstance(losses, GilbertElliott):
-        chain = losses.as_chain
-        return _hidden(losses) if chain is None else law_of(chain)
+    chain = losses.as_chain
+    if chain is None:
+        assert isinstance(losses, Hidden)
+        state, fate, chance = _pairs(losses)
+        return Law(losses.initial[state] * chance, losses.transition[np.ix_(state, state)] * chance, fate)
     return Law(
-        np.array([1.0 - losses.start, losses.start]),
-        np.array([[1.0 - losses.recovery, losses.recovery], [losses.failure, 1.0 - losses.failure]]),
+        np.array([1.0 - chain.start, chain.start]),
+        np.array([[1.0 - chain.recovery, chain.recovery], [chain.failure, 1.0 - chain.failure]]),
         np.array([False, True]),
     )
 
 
 def stationary_of(losses: LossModel) -> NDArray[np.float64]:
     """The stationary law of the states of ``law_of(losses)``, (H,)."""
-    if isinstance(losses, GilbertElliott):
-        chain = losses.as_chain
-        if chain is None:
-            state, _, chance = _pairs(losses)
-            pairs: NDArray[np.float64] = np.array([1.0 - losses.states.arrival, losses.states.arrival])[state] * chance
-            return pairs
-        losses = chain
-    return np.array([1.0 - losses.arrival, losses.arrival])
+    chain = losses.as_chain
+    if chain is None:
+        assert isinstance(losses, Hidden)
+        state, _, chance = _pairs(losses)
+        pairs: NDArray[np.float64] = losses.stationary[state] * chance
+        return pairs
+    return np.array([1.0 - chain.arrival, chain.arrival])
 
 
-def _hidden(losses: GilbertElliott) -> Law:
-    states = law_of(losses.states)
-    state, fate, chance = _pairs(losses)
-    return Law(states.initial[state] * chance, states.transition[np.ix_(state, state)] * chance, fate)
-
-
-def _pairs(losses: GilbertElliott) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.float64]]:
-    """State (0 bad, 1 good), fate, and P(fate | state) of each pair that can happen."""
-    lost = np.array([losses.loss_bad, losses.loss_good])
-    state, fate = np.tile([0, 1], 2), np.repeat([False, True], 2)
-    chance = np.where(fate, 1.0 - lost[state], lost[state])
+def _pairs(losses: Hidden) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.float64]]:
+    """State, fate, and P(fate | state) of each pair that can happen."""
+    states = np.flatnonzero(reached(losses.initial > 0.0, losses.transition))
+    state, fate = np.tile(states, 2), np.repeat([False, True], len(states))
+    chance = np.where(fate, 1.0 - losses.loss[state], losses.loss[state])
     happens = chance > 0.0
     return state[happens], fate[happens], chance[happens]

@@ -72,9 +72,23 @@ class Chain:
         return 1.0 - self.recovery - self.failure
 
     @property
-    def coupling(self) -> float:
-        """1: the fate is the state. See GilbertElliott."""
-        return 1.0
+    def correlation(self) -> float:
+        """Corr(γ_0, γ_1) of the fates of neighbours."""
+        return self.memory
+
+    @property
+    def covariance_factor(self) -> float | None:
+        """f with Σ_j |Cov(γ_i, γ_j)| ≤ ¼ f for all i and any start: (1 + |r|)/(1 − |r|), None where it is infinite."""
+        r = 0.0 if self.independent or self.never_loses else abs(self.memory)
+        return (1.0 + r) / (1.0 - r) if r < 1.0 else None
+
+    def share_moments(self, packets: int) -> tuple[float, float]:
+        """Mean of the share of so many packets that is delivered, from the first on, and its stationary variance."""
+        leaving, rho, arrival = self.recovery + self.failure, self.memory, self.arrival
+        geometric = (1.0 - rho**packets) / leaving  # Σ ρ^j, j = 0 … n − 1
+        together = rho * (packets - geometric) / leaving  # Σ (n − j) ρ^j, j = 1 … n − 1
+        mean = arrival + (self.start - arrival) * geometric / packets
+        return mean, arrival * (1.0 - arrival) * (packets + 2.0 * together) / packets**2
 
     @property
     def burst_decay(self) -> float:
@@ -92,6 +106,8 @@ class Chain:
 
 class LossProcess:
     """Draws the fate of packet 0, 1, 2, … for a block of lanes."""
+
+    states = 2
 
     def __init__(self, chain: Chain, stream: Stream, lanes: int) -> None:
         self.chain, self._stream, self._lanes = chain, stream, lanes

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from testbed.channel.chains import chain_of
-from testbed.channel.gilbert_elliott import GilbertElliott, GilbertElliottProcess
-from testbed.channel.law import LossModel
-from testbed.channel.loss import LossCounts, LossProcess
+from testbed.channel.carriers import carriers_of
+from testbed.channel.loss import LossCounts
+from testbed.channel.processes import FateProcess, process_of
+from testbed.channel.steps import SteppedLink
+from testbed.channel.timed import TimedBlock
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
-from testbed.scenario import Link, NoLoss, Scenario
+from testbed.scenario import AckLink, Link, Loss, NoLoss, Scenario
+from testbed.scenario.links import SteppedImpairments
+from testbed.wire.codec import PacketEncoder
 from testbed.wire.keys import LinkName
 from testbed.wire.messages import Acknowledgement, Control, Observation, Packet
 from testbed.wire.node import Node
@@ -37,25 +41,53 @@ def builder(link: LinkName) -> Any:
     return partial(LinkService, link=link)
 
 
-def losses_of(scenario: Scenario, link: LinkName) -> LossModel:
-    """The loss model of a link; that of an ACK link that is none or perfect loses nothing."""
+def loss_of(scenario: Scenario, link: LinkName) -> Loss:
+    """The loss of a link; that of an ACK link that is none or perfect loses nothing."""
     settings = getattr(scenario.links, link)
-    return chain_of(settings.loss if isinstance(settings, Link) or settings.mode == "link" else NoLoss())
+    loss: Loss = settings.loss if isinstance(settings, Link) or settings.mode == "link" else NoLoss()
+    return loss
 
 
-def loss_process(scenario: Scenario, link: LinkName, lane: int, lanes: int) -> LossProcess | GilbertElliottProcess:
-    """The loss process of a block of lanes of a link; the same draws wherever it runs.
-
-    The hidden states have a stream of their own: the draws that decide over the packets are the same for every loss.
-    """
+def loss_process(scenario: Scenario, link: LinkName, lane: int, lanes: int) -> FateProcess:
+    """The loss process of a block of lanes of a link; the same draws wherever it runs."""
 
     def stream(purpose: str) -> Stream:
         return Stream(scenario.seed, role_of(link), purpose, width=1, lane=lane, lanes=lanes)
 
-    losses = losses_of(scenario, link)
-    if isinstance(losses, GilbertElliott):
-        return GilbertElliottProcess(losses, stream("state"), stream("loss"), lanes)
-    return LossProcess(losses, stream("loss"), lanes)
+    return process_of(loss_of(scenario, link), stream, lanes)
+
+
+def timed_block(scenario: Scenario, link: LinkName, lane: int, lanes: int, size: int) -> TimedBlock:
+    """A block of lanes of a link that takes time; size: bytes of a packet of one lane."""
+    settings: SteppedImpairments = getattr(scenario.links, link)
+    period_ns = scenario.clock.period_ns
+    carriers = carriers_of(settings, scenario.seed, role_of(link), lane, lanes)
+    stepped = SteppedLink(carriers, size, period_ns, settings.deadline_ns(period_ns))
+    model, _, name = _TYPES[link]
+    batch = settings.batch if isinstance(settings, AckLink) else 1
+    return TimedBlock(stepped, lanes, name, first_step=model.FIRST_STEP, batch=batch)
+
+
+def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]:
+    """The counters of a link that takes time; nothing where there is no block."""
+    total: Counter[str] = Counter()
+    for block in blocks:
+        books = block.books
+        total["late"] += block.late
+        if not keeps_late:
+            books.delivered -= block.late
+            books.dropped["late"] += block.late
+        counts = block.counts.as_counters()
+        total.update({key: counts[key] for key in ("bursts", "00", "01", "10", "11")})
+        total.update(books.as_counters())
+    return dict(total)
+
+
+def _size(node: Node, model: type[Packet], content: str, setup: Setup) -> int:
+    """Bytes of a packet of one lane as the testbed encodes it."""
+    widths = {"y": setup.sizes.p, "u": setup.sizes.q}
+    array = np.zeros((1, widths[content])) if content in widths else np.zeros(1, dtype=np.uint8)
+    return len(PacketEncoder(model, setup.run, node.name).encode(0, model.FIRST_STEP, 0, 1, {content: array}))
 
 
 class LinkService:
@@ -63,28 +95,49 @@ class LinkService:
 
     A packet that arrives in some lanes is passed on with its mask and zeros elsewhere; one that arrives in none is
     passed on as a bare mask, which tells the receiver that the step is over (virtual time has no other way).
+    What arrives late goes with the packet of the step in which it does; late control packets are dropped.
     Where the scenario says that noise is received in place of a lost observation, that stands there with mask 0.
     """
 
     def __init__(self, node: Node, setup: Setup, *, link: LinkName) -> None:
         model, sender, self._content = _TYPES[link]
-        self._losses = {lane: loss_process(setup.scenario, link, lane, lanes) for lane, lanes in setup.blocks}
+        settings: SteppedImpairments = getattr(setup.scenario.links, link)
+        batch = settings.batch if isinstance(settings, AckLink) else 1
+        timed = settings.takes_time or batch > 1
+        self._losses = {
+            lane: loss_process(setup.scenario, link, lane, lanes) for lane, lanes in setup.blocks if not timed
+        }
+        size = _size(node, model, self._content, setup)
+        self._timed = {
+            lane: timed_block(setup.scenario, link, lane, lanes, size) for lane, lanes in setup.blocks if timed
+        }
+        self._keeps_late = link != "control"
         self._counts = LossCounts()
         self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
         noise = link == "observation" and setup.scenario.links.observation.on_loss == "noise"
         self._instead = "noise" if noise else None
         needs = (self._content, self._instead) if self._instead else (self._content,)
-        node.on(node.keys.sent(link), model, sender, self._pass_on, needs=needs)
+        handler = self._pass_on_timed if timed else self._pass_on
+        node.on(node.keys.sent(link), model, sender, handler, needs=needs)
 
     @property
     def counters(self) -> dict[str, int]:
-        return self._counts.as_counters()
+        return timed_counters(list(self._timed.values()), self._keeps_late) or self._counts.as_counters()
 
     def _pass_on(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         lane = packet.lane
         arrived = self._losses[lane].next(packet.step - packet.FIRST_STEP)
         self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
         self._counts.count(lane, arrived)
+
+    def _pass_on_timed(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
+        lane, number = packet.lane, packet.step - packet.FIRST_STEP
+        if self._keeps_late:
+            delivered = self._timed[lane].pass_on(number, arrays[self._content])
+        else:
+            arrived = self._timed[lane].in_time(number)
+            delivered = self._content_of(arrays, arrived if packet.lanes > 1 else bool(arrived[0]))
+        self._deliver(packet.step, lane, packet.lanes, delivered)
 
     def _content_of(self, arrays: dict[str, NDArray[Any]], arrived: Mask) -> dict[str, NDArray[Any]]:
         if self._instead is not None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
-from testbed.channel.chains import chain_of
-from testbed.channel.gilbert_elliott import GilbertElliott, GilbertElliottProcess
-from testbed.channel.loss import LossProcess
+from testbed.channel.processes import FateProcess, process_of
 from testbed.numerics.streams import Stream
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.links import Impairments
@@ -25,23 +24,21 @@ class Losses:
     def __init__(self, settings: Impairments, stream_of: StreamOf) -> None:
         self._stream_of = stream_of
         self._slot = -1
-        self._good = True
+        self._state: Any = None
         self._set(settings)
 
     def change(self, settings: Impairments) -> None:
-        """Other losses from now on: the streams go on, and so does the state, where there was one."""
+        """Other losses from now on: the streams go on, and so does the state where there are as many as before."""
         before = self._process
         self._set(settings)
-        self._process.state = before.state
+        if self._process.states == before.states:
+            self._process.state = before.state
+        elif self._slot >= 0:
+            self._slot -= 1  # a first state of the new kind, in this slot
 
     def _set(self, settings: Impairments) -> None:
-        losses = chain_of(settings.loss)
         self._slot_ns = None if settings.slot is None else parse_duration(settings.slot)
-        self._process: LossProcess | GilbertElliottProcess
-        if isinstance(losses, GilbertElliott):
-            self._process = GilbertElliottProcess(losses, self._stream_of("state"), self._stream_of("loss"), 1)
-        else:
-            self._process = LossProcess(losses, self._stream_of("loss"), 1)
+        self._process: FateProcess = process_of(settings.loss, self._stream_of, 1)
 
     def arrives(self, number: int, now_ns: int) -> bool:
         """The fate of packet ``number``, sent now."""
@@ -50,5 +47,5 @@ class Losses:
         slot = now_ns // self._slot_ns
         while self._slot < slot:
             self._slot += 1
-            self._good = bool(self._process.move(self._slot))
-        return bool(self._process.fate(number, self._good))
+            self._state = self._process.move(self._slot)
+        return bool(self._process.fate(number, self._state))

@@ -1,24 +1,19 @@
-"""Traces: what became of each packet of a link. Written for a link of a scenario, read from anywhere."""
+"""Traces: what became of each packet of a link of a scenario."""
 
 from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from testbed.channel.chains import chain_of
 from testbed.channel.law import LossModel
 from testbed.channel.loss import LossCounts
-from testbed.channel.service import loss_process, losses_of
-from testbed.errors import UsageError
-from testbed.numerics.lanes import Bools
+from testbed.channel.service import loss_of, loss_process
 from testbed.scenario import Scenario
+from testbed.scenario.trace_file import HEADER
 from testbed.wire.keys import LinkName
-
-HEADER = ("seq", "sent_ns", "delivered_ns")
 
 
 @dataclass(frozen=True)
@@ -52,7 +47,7 @@ def sample_trace(scenario: Scenario, link: LinkName, number: int, *, seed: int, 
         arrived = process.next(seq)
         counts.count(lane, arrived)
         rows.append((seq, seq * period_ns, seq * period_ns if arrived else None))
-    return Trace(rows, counts, losses_of(scenario, link))
+    return Trace(rows, counts, chain_of(loss_of(scenario, link)))
 
 
 def write_trace(path: Path, trace: Trace) -> None:
@@ -61,65 +56,3 @@ def write_trace(path: Path, trace: Trace) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(HEADER)
         writer.writerows(("" if field is None else field for field in row) for row in trace.rows)
-
-
-@dataclass(frozen=True, eq=False)
-class Fates:
-    """What became of the packets of a trace, in the order of seq: arrived (n,); rows beyond the first of a packet."""
-
-    arrived: Bools
-    duplicates: int
-
-
-def read_fates(path: Path) -> Fates:
-    """The fates in a TRACE.csv. Rows come in any order; a packet arrived if one of its rows has delivered_ns.
-
-    Raises UsageError where it is no such file, or where a packet between the first and the last has no row.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return _fates(path, csv.reader(file, strict=True))
-    except OSError as error:
-        raise UsageError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from None
-    except (UnicodeDecodeError, csv.Error):
-        raise UsageError(f"{path}: not a trace; {_ALLOWED}") from None
-
-
-_DIGITS_MAX = 20  # of 64 bits
-_ALLOWED = f"allowed: CSV in UTF-8 with the header {','.join(HEADER)}"
-
-
-def _fates(path: Path, rows: Any) -> Fates:
-    header = next(rows, None)
-    if header is None or tuple(name.strip() for name in header) != HEADER:
-        got = "an empty file" if header is None else f"the header {','.join(header)[:60]!r}"
-        raise UsageError(f"{path}: not a trace: got {got}; {_ALLOWED}")
-    arrived: dict[int, bool] = {}
-    read = 0
-    for row in rows:
-        if not row:
-            continue
-        where = f"{path}:{rows.line_num}"
-        if len(row) != len(HEADER):
-            raise UsageError(f"{where}: got {len(row)} field{'s' * (len(row) != 1)}; allowed: {len(HEADER)}")
-        seq, _, delivered = (_whole(where, name, text.strip()) for name, text in zip(HEADER, row, strict=True))
-        assert seq is not None
-        arrived[seq] = arrived.get(seq, False) or delivered is not None
-        read += 1
-    order = sorted(arrived)
-    for before, after in pairwise(order):
-        if after != before + 1:
-            raise UsageError(
-                f"{path}: no row for packet {before + 1}; allowed: a row for each from {order[0]} to {order[-1]}, "
-                "with delivered_ns empty where it was lost"
-            )
-    return Fates(np.array([arrived[seq] for seq in order], dtype=np.bool_), read - len(order))
-
-
-def _whole(where: str, name: str, text: str) -> int | None:
-    if not text and name == "delivered_ns":
-        return None
-    if len(text) > _DIGITS_MAX or not text.removeprefix("-").isdecimal():
-        none = ", or nothing for a lost packet" if name == "delivered_ns" else ""
-        raise UsageError(f"{where}: {name}: got {text[:40]!r}; allowed: a whole number{none}")
-    return int(text)

@@ -139,7 +139,7 @@ def _link(link: dict[str, Any], name: str) -> list[tuple[str, str]]:
             ("its bursts of losses", f"mean {_number(link['mean_burst'])}{longest}"),
             ("its runs of deliveries", f"mean {_number(link['mean_good_run'])}"),
             ("its θ", f"{_number(link['burst_decay'])}: P(m losses in a row) falls like θ^m"),
-            ("its correlation", f"{near} between neighbours, times {further} a packet"),
+            ("its correlation", f"{near} between neighbours, in the long run times {further} a packet"),
         ]
     return [
         (f"{name} link", lost),

@@ -69,13 +69,13 @@ def fit(
     trace: Annotated[Path, typer.Argument(metavar="TRACE.csv", help="A trace, as `testbed link sample` writes it.")],
     json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
-    """Fit Bernoulli, Markov and Gilbert-Elliott losses to a trace by maximum likelihood, and choose by BIC.
+    """Fit Bernoulli, Markov, Gilbert-Elliott and four-state losses to a trace by maximum likelihood, and choose by BIC.
 
     Shows the parameters with 95 % intervals, whether the lengths of bursts and gaps fit, and the line for the
     scenario. A packet with several rows is one packet, which arrived if one of them has delivered_ns.
     """
     from testbed.analysis.fit import fit_losses
-    from testbed.channel.trace import read_fates
+    from testbed.scenario.trace_file import read_fates
 
     fates = read_fates(trace)
     try:

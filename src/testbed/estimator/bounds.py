@@ -6,18 +6,19 @@ P_0 = 0, a chain that never moves from its start ½ and no observation, P_2 = 5 
 Cov(ν_i, ν_j) ≤ ¼ |r|^|i−j| with r = 1 − recovery − failure, and by Gershgorin's theorem, ¼U (1 + |r|)/(1 − |r|) a step
 is enough for the best estimator; that is the *correlated* upper bound here. For Gilbert–Elliott losses Cov(ν_i, ν_j) =
 δ² r^|i−j| Var(s_i), i < j, with s_i = 1 in the good state, r the memory of the states, and δ the difference of their
-arrival probabilities: ¼U (1 + 2 δ² |r|/(1 − |r|)) is enough.
+arrival probabilities: ¼U (1 + 2 δ² |r|/(1 − |r|)) is enough. In general the factor of ¼U is the ``covariance_factor``
+of the losses.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache, partial
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from testbed.channel.gilbert_elliott import GilbertElliott
-from testbed.channel.law import LossModel
 from testbed.estimator.model import Model
 from testbed.estimator.riccati import Gain, phi, predict
 from testbed.numerics.lanes import Constant, Floats, Mask, Matrix, constant, mask_of, matrices_of
@@ -25,30 +26,57 @@ from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
 
-def correlation_factor(control: LossModel) -> float | None:
-    """(1 + |r|)/(1 − |r|) of the control losses: 1 for i.i.d. ones, None where it is infinite."""
-    r = 0.0 if control.independent or control.never_loses else abs(control.memory)
-    if isinstance(control, GilbertElliott):
-        return 1.0 + 2.0 * control.contrast**2 * r / (1.0 - r) if r < 1.0 else None
-    return (1.0 + r) / (1.0 - r) if r < 1.0 else None
-
-
 class CovarianceBound:
     """P_{k+1} = φ(A P_k A' + noise, γ_{k+1}) from P_0 in every lane: Pᴬ with noise Q, S with Q + ¼U."""
 
     def __init__(self, model: Model, noise: Floats, lanes: int) -> None:
-        _, self._p = model.prior(lanes)
+        _, self.p = model.prior(lanes)
         self._advance = _stepper(model, constant(noise), lanes)
 
     def step(self, arrived: NDArray[Any]) -> Matrix:
         """The bound after the observations ``arrived`` (M,) of the next step."""
-        (self._p,) = self._advance(mask_of(arrived), self._p)
-        return self._p
+        (self.p,) = self._advance(mask_of(arrived), self.p)
+        return self.p
 
 
 def upper_bound(model: Model, U: Floats, lanes: int) -> CovarianceBound:
     """S for an input with B u_k u_k' B' ≤ U for all k."""
     return CovarianceBound(model, model.Q + 0.25 * U, lanes)
+
+
+class LateBound:
+    """Pᴬ_k given all observations of steps 1 … k that have arrived by k, late ones too.
+
+    Steps are remembered for ``depth``. What comes later than that counts as not arrived, and ``old`` counts it.
+    """
+
+    def __init__(self, model: Model, lanes: int, depth: int) -> None:
+        self._bound = CovarianceBound(model, model.Q, lanes)
+        self._depth, self._k, self.old = depth, 0, 0
+        self._states: dict[int, tuple[Matrix, NDArray[Any]]] = {}
+        """By step: what was known before it, and where its observation has arrived."""
+
+    def step(self, arrived: NDArray[Any], late: Iterable[tuple[int, NDArray[Any]]] = ()) -> Matrix:
+        """The bound after the next step's observations ``arrived`` (M,), and ``late`` ones: (step, lanes (M,))."""
+        again = self._k + 1
+        for step, lanes in late:
+            if step in self._states:
+                before, known = self._states[step]
+                self._states[step] = before, np.asarray(known, dtype=np.bool_) | np.asarray(lanes, dtype=np.bool_)
+                again = min(again, step)
+            else:
+                self.old += int(np.count_nonzero(lanes))
+        if again <= self._k:
+            self._bound.p = self._states[again][0]
+            for step in range(again, self._k + 1):
+                self._take(step, self._states[step][1])
+        self._k += 1
+        self._states.pop(self._k - self._depth, None)
+        return self._take(self._k, arrived)
+
+    def _take(self, step: int, arrived: NDArray[Any]) -> Matrix:
+        self._states[step] = self._bound.p, arrived
+        return self._bound.step(np.asarray(arrived, dtype=np.uint8))
 
 
 class Bounds:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.errors import RunFailed
-from testbed.estimator.bounds import Bounds, correlation_factor, upper_bound
+from testbed.estimator.bounds import Bounds, LateBound, upper_bound
 from testbed.estimator.registry import model_of
 from testbed.numerics.lanes import Component, trace
 from testbed.plant.inputs import control_bound
@@ -18,26 +18,43 @@ from testbed.wire.node import Node
 from testbed.wire.setup import Setup
 
 ROLE = "bounds"
+_DEPTH = 256
+"""Steps that the lower bound goes back for a late observation."""
 
 
 class BoundsService:
-    """Publishes the traces of Pᴬ_k and S_k of every lane, and under correlated control losses of the correlated S_k."""
+    """Publishes the traces of Pᴬ_k and S_k of every lane, and under correlated control losses of the correlated S_k.
+
+    The lower bound uses late observations, the upper ones do not: so they hold whether an estimator does or does not.
+    """
 
     def __init__(self, node: Node, setup: Setup) -> None:
         model, bound = model_of(setup.scenario), control_bound(setup.scenario)
-        factor = correlation_factor(model.control)
+        factor = model.control.covariance_factor
         self._blocks = {lane: Bounds(model, bound, lanes) for lane, lanes in setup.blocks}
         self._correlated = {
             lane: upper_bound(model, factor * bound, lanes)
             for lane, lanes in setup.blocks
             if bound is not None and factor is not None and factor > 1.0
         }
+        self._late = {
+            lane: LateBound(model, lanes, _DEPTH)
+            for lane, lanes in setup.blocks
+            if setup.scenario.links.observation.takes_time
+        }
         self._send = node.sender(node.keys.bounds, BoundsMessage, lazy=True)
-        self.counters: dict[str, int] = {}
         node.on(node.keys.delivered("observation"), Observation, "link.observation", self._take, needs=("mask",))
+
+    @property
+    def counters(self) -> dict[str, int]:
+        old = sum(bound.old for bound in self._late.values())
+        return {"old_observations": old} if old else {}
 
     def _take(self, packet: Observation, arrays: dict[str, NDArray[Any]]) -> None:
         lower, upper = self._blocks[packet.lane].components(arrays["mask"])
+        if packet.lane in self._late:
+            late = [(int(of), arrays["late_mask"][:, i]) for i, of in enumerate(_steps(arrays))]
+            lower = self._late[packet.lane].step(arrays["mask"], late)
         traces = {"trace_lower": _lanes(trace(lower), packet.lanes)}
         if upper is not None:
             traces["trace_upper"] = _lanes(trace(upper), packet.lanes)
@@ -47,6 +64,10 @@ class BoundsService:
         if not all(all_finite(values) for values in traces.values()):
             raise RunFailed(f"the bounds left the range of floating-point numbers at step {packet.step}")
         self._send(packet.step, packet.lane, packet.lanes, traces)
+
+
+def _steps(arrays: dict[str, NDArray[Any]]) -> NDArray[Any]:
+    return arrays["late_step"][0] if "late_step" in arrays else np.zeros(0)
 
 
 def _lanes(component: Component, lanes: int) -> NDArray[np.float64]:

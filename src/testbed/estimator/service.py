@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.errors import RunFailed
-from testbed.estimator.model import Ack, Estimator, seen
+from testbed.estimator.model import Ack, Estimator, Restartable, seen
+from testbed.estimator.refilter import LateObservation, Refilter
 from testbed.estimator.registry import create, model_of
 from testbed.numerics.lanes import Floats
 from testbed.scenario import EstimatorSpec, Scenario
@@ -17,6 +18,9 @@ from testbed.wire.codec import all_finite
 from testbed.wire.messages import Acknowledgement, Control, EstimateMessage, Observation, Packet
 from testbed.wire.node import Node
 from testbed.wire.setup import Setup
+
+BUFFER = 20
+"""Steps that an estimator can go back, unless its table says otherwise, where observations or ACKs can be late."""
 
 
 def role_of(name: str) -> str:
@@ -37,11 +41,24 @@ def acks_of(scenario: Scenario, spec: EstimatorSpec) -> str:
     return spec.acks if spec.acks is not None else scenario.links.ack.mode
 
 
+def buffer_of(scenario: Scenario, spec: EstimatorSpec) -> int:
+    """Steps that an estimator can go back: as its table says, or as many as are of use."""
+    if spec.buffer is not None:
+        return spec.buffer
+    links = scenario.links
+    late = links.observation.takes_time
+    if acks_of(scenario, spec) == "link":
+        late = late or links.ack.takes_time or links.ack.batch > 1
+    return BUFFER if late else 0
+
+
 class _Block:
     """The parts of coming steps of one block of lanes."""
 
-    def __init__(self, estimator: Estimator, lanes: int, parts: int) -> None:
+    def __init__(self, estimator: Estimator, buffer: int, lanes: int, parts: int) -> None:
+        """buffer: steps that the estimator can go back, where it gives its state."""
         self.estimator, self.lanes = estimator, lanes
+        self.refilter = Refilter(estimator, buffer if isinstance(estimator, Restartable) else 0)
         self._parts = parts
         self._waiting: dict[int, dict[str, dict[str, NDArray[Any]]]] = {}
 
@@ -67,6 +84,7 @@ class EstimatorService:
         self._blocks = {
             lane: _Block(
                 create(spec.kind, model, lanes=lanes, options=spec.options, lane=lane),
+                buffer_of(scenario, spec),
                 lanes,
                 2 if acks == "none" else 3,
             )
@@ -86,7 +104,7 @@ class EstimatorService:
     def counters(self) -> dict[str, int]:
         total: dict[str, int] = {}
         for block in self._blocks.values():
-            for key, value in block.estimator.counters.items():
+            for key, value in block.refilter.counters.items():
                 total[key] = total.get(key, 0) + value
         return total
 
@@ -105,7 +123,8 @@ class EstimatorService:
         mask = observation["mask"]
         received = np.ones(block.lanes, dtype=np.uint8) if self._noise else mask
         arrived = seen(block.estimator, mask, received)
-        estimate = block.estimator.step(parts["u"]["u"], y, arrived, _acks(step, parts.get("ack")))
+        late = _late_observations(observation)
+        estimate = block.refilter.step(parts["u"]["u"], y, arrived, _acks(step, parts.get("ack")), late)
         x_hat, P = estimate.x_hat, estimate.P
         if not (all_finite(x_hat) and all_finite(P)):
             raise RunFailed(f"the estimate of '{self._name}' left the range of floating-point numbers at step {step}")
@@ -116,8 +135,21 @@ class EstimatorService:
 
 
 def _acks(step: int, arrays: dict[str, NDArray[Any]] | None) -> tuple[Ack, ...]:
-    """The ACKs that came with a step: on a perfect path without a mask, on a link with one."""
-    if arrays is None or "nu" not in arrays:
+    """The ACKs that came with a step: on a perfect path without a mask, on a link with one; late ones behind."""
+    if arrays is None:
         return ()
-    nu = arrays["nu"]
-    return (Ack(step - 1, nu, arrays.get("mask", np.ones(len(nu), dtype=np.uint8))),)
+    out = []
+    if "nu" in arrays:
+        nu = arrays["nu"]
+        out.append(Ack(step - 1, nu, arrays.get("mask", np.ones(len(nu), dtype=np.uint8))))
+    if "late_nu" in arrays:
+        nu, known = arrays["late_nu"], arrays["late_mask"]
+        out += [Ack(int(of) - 1, nu[:, i], known[:, i]) for i, of in enumerate(arrays["late_step"][0])]
+    return tuple(out)
+
+
+def _late_observations(arrays: dict[str, NDArray[Any]]) -> tuple[LateObservation, ...]:
+    if "late_y" not in arrays:
+        return ()
+    y, arrived = arrays["late_y"], arrays["late_mask"]
+    return tuple(LateObservation(int(of), y[:, i], arrived[:, i]) for i, of in enumerate(arrays["late_step"][0]))

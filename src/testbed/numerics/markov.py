@@ -50,7 +50,7 @@ def _eliminated(transition: Floats) -> Floats:
     law = np.ones(len(rates))
     for h in range(1, len(rates)):
         law[h] = law[:h] @ rates[:h, h]
-    return law / law.sum()
+    return np.asarray(law / law.sum())
 
 
 def mixing_sums(transition: Floats, law: Floats, steps: int) -> tuple[Floats, Floats]:
@@ -69,28 +69,24 @@ _DOUBLINGS = 60
 _FORGOTTEN = 1e-18
 
 
-def summed_ranges(transition: Floats, values: Floats) -> float | None:
+def summed_ranges(transition: Floats, law: Floats, values: Floats) -> float | None:
     """A bound of Σ_{j≥1} (max − min of T^j values), T = transition (H, H), values (H,); None where none is found.
 
-    Exactly for 64 terms; then the sum of the next 2^i terms is at most that of all before times τ(T^j), with Dobrushin's
-    coefficient τ: max − min of T^j v is at most τ(T^j) (max − min of v).
+    Exactly for the first terms; then the sum of the next 2^i terms is at most that of all before times τ(T^j), by
+    Dobrushin's coefficient τ: max − min of T^j v is at most τ(T^j) (max − min of v). law (H,) is the stationary one; of
+    two states the bound is exact.
     """
-    total, power = 0.0, transition
-    if len(values) == 2:  # there the bound is exact from the first term
-        total = float(np.ptp(transition @ values))
-    else:
-        ahead = values
-        for _ in range(_AT_ONCE):
-            ahead = transition @ ahead
-            total += float(np.ptp(ahead))
-        power = np.linalg.matrix_power(transition, _AT_ONCE)
+    left = transition - law  # its powers tell rows apart as those of T do, and they vanish
+    exact = 1 if len(values) == 2 else _AT_ONCE
+    total, ahead = 0.0, values
+    for _ in range(exact):
+        ahead = left @ ahead
+        total += float(np.ptp(ahead))
+    power = np.linalg.matrix_power(left, exact)
     for _ in range(_DOUBLINGS):
-        if not total > 0.0:
-            return 0.0
         kept = 0.5 * float(np.abs(power[:, None] - power[None, :]).sum(axis=2).max())
-        if kept < _FORGOTTEN:
+        if kept < _FORGOTTEN or total == 0.0:
             return total
         total *= 1.0 + kept
         power = power @ power
-        power = power / power.sum(axis=1, keepdims=True)
     return None

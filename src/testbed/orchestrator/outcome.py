@@ -11,9 +11,8 @@ import numpy as np
 from testbed import __version__
 from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
-from testbed.channel.chains import chain_of
-from testbed.channel.gilbert_elliott import GilbertElliott
-from testbed.estimator.bounds import correlation_factor
+from testbed.channel.hidden import Hidden
+from testbed.channel.in_time import law_in_steps
 from testbed.estimator.service import acks_of, role_of
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import (
@@ -73,21 +72,28 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
 def link_figures(counters: dict[str, int]) -> LinkFigures:
     """A link's figures from the counters it reported."""
     sent, dropped, bursts = counters["sent"], counters["dropped"], counters["bursts"]
+    losses = {"loss": dropped} if dropped else {}
+    causes = {key.removeprefix("dropped_"): n for key, n in counters.items() if key.startswith("dropped_") and n}
     return LinkFigures(
         sent=sent,
         delivered=counters["delivered"],
         dropped=dropped,
+        duplicated=counters.get("duplicated", 0),
+        late=counters.get("late", 0),
+        in_flight=counters.get("in_flight", 0),
+        corrupted=counters.get("corrupted", 0),
+        causes=causes or losses,
         transitions=Transitions.model_validate({key: counters[key] for key in ("00", "01", "10", "11")}),
-        loss_rate=dropped / sent if sent else None,
-        mean_burst=dropped / bursts if bursts else None,
+        loss_rate=(sent - min(sent, counters["delivered"] + counters.get("in_flight", 0))) / sent if sent else None,
+        mean_burst=(counters["00"] + bursts) / bursts if bursts else None,
     )
 
 
 def moment_checks(scenario: Scenario) -> list[Check]:
     """Whether the EEC and the variance of its sample mean can be finite."""
-    A, losses = np.array(scenario.system.A), chain_of(scenario.links.observation.loss)
+    A, losses = np.array(scenario.system.A), law_in_steps(scenario.links.observation, scenario.clock.period_ns)
     order, rho, decay = finite_moment_order(A, losses), spectral_radius(A), losses.burst_decay
-    hidden = isinstance(losses, GilbertElliott)
+    hidden = isinstance(losses, Hidden)
     burst = f"θ = {decay:.6g}" if hidden else f"P(arrival after a loss) = {losses.recovery:.6g}"
     where, factor = f"ρ(A) = {rho:.6g}, {burst}", "θ" if hidden else "(1 − recovery)"
     growth = rho * rho  # a power would raise where this is infinite
@@ -113,15 +119,17 @@ def books(scenario: Scenario, links: dict[str, LinkFigures], applied: int) -> li
     for name, link in links.items():
         if link.sent != total:
             wrong.append(f"link {name}: {link.sent} lane-packets sent, {total} expected")
-        if link.delivered + link.dropped + link.in_flight != link.sent:
-            wrong.append(f"link {name}: delivered and dropped do not add up to {link.sent}")
+        if link.delivered + link.dropped + link.in_flight != link.sent + link.duplicated:
+            wrong.append(f"link {name}: delivered and dropped do not add up to {link.sent + link.duplicated}")
     for name in ("control", "observation"):
         if name not in links:
             wrong.append(f"link {name} did not report")
     if "control" in links and links["control"].delivered != applied:
         wrong.append(f"link control delivered {links['control'].delivered}, the plant applied {applied}")
-    text = "; ".join(wrong) or f"{total} lane-packets a link: sent = delivered + dropped, delivered = applied"
-    return [Check(name="books", ok=not wrong, text=text)]
+    text = f"{total} lane-packets a link: sent = delivered + dropped, delivered = applied"
+    if any(link.in_flight or link.duplicated for link in links.values()):
+        text = text.replace("sent = delivered + dropped", "sent + copies = delivered + dropped + in flight")
+    return [Check(name="books", ok=not wrong, text="; ".join(wrong) or text)]
 
 
 def rounding(largest_state: list[float], estimators: dict[str, EstimatorFigures]) -> list[Check]:
@@ -224,7 +232,7 @@ def _bounds(conductor: Conductor) -> BoundFigures | None:
         upper["upper_correlated_mean"] = series.mean["upper_correlated"]
         upper["upper_correlated_stderr"] = series.stderr["upper_correlated"]
     reason: str | None = None
-    if correlation_factor(chain_of(scenario.links.control.loss)) is None:
+    if law_in_steps(scenario.links.control, scenario.clock.period_ns).covariance_factor is None:
         reason = "the control losses never mix, and S holds for independent ones"
     if scenario.uncertainty is not None:
         reason = "the bounds are those of the nominal model, and the plant departs from it"

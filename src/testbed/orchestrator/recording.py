@@ -64,10 +64,14 @@ def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[s
         elif topic == "observation/delivered":
             parts = steps.setdefault(packet.step, {})
             parts["y"], parts["gamma"] = arrays["y"][row].tolist() if "y" in arrays else None, int(arrays["mask"][row])
+            parts["late"] = [[of, arrays["late_y"][row, i].tolist()] for i, of in _late(arrays, row)]
         elif topic == "observation/sent":
             noisy = noisy or "noise" in arrays
-        elif topic == acks_topic and "nu" in arrays and ("mask" not in arrays or arrays["mask"][row]):
-            steps.setdefault(packet.step, {})["acks"] = [[packet.step - 1, int(arrays["nu"][row])]]
+        elif topic == acks_topic:
+            acks = [[of - 1, int(arrays["late_nu"][row, i])] for i, of in _late(arrays, row)]
+            if "nu" in arrays and ("mask" not in arrays or arrays["mask"][row]):
+                acks.append([packet.step - 1, int(arrays["nu"][row])])
+            steps.setdefault(packet.step, {})["acks"] = acks
     if not steps:
         raise UsageError(f"{path}: lane {lane} was not recorded; see `record` in the scenario")
     whole = [k for k, parts in steps.items() if "u" in parts and "y" in parts]
@@ -76,8 +80,17 @@ def packets_of_recording(path: Path, lane: int, *, perfect_acks: bool) -> list[s
     return [json.dumps({"k": k, **_line(steps[k], noisy=noisy)}) for k in sorted(whole)]
 
 
+def _late(arrays: _Arrays, row: int) -> list[tuple[int, int]]:
+    """(place, step) of what arrived late in a lane."""
+    if "late_step" not in arrays:
+        return []
+    return [(i, int(of)) for i, of in enumerate(arrays["late_step"][row]) if arrays["late_mask"][row, i]]
+
+
 def _line(parts: dict[str, Any], *, noisy: bool) -> dict[str, Any]:
     """What a line says besides k: γ only where a y that was received is noise."""
     arrived = bool(parts["gamma"])
     line = {"u": parts["u"], "y": parts["y"] if arrived or noisy else None, "acks": parts.get("acks", [])}
+    if parts.get("late"):
+        line["late"] = parts["late"]
     return line if arrived or not noisy else {**line, "gamma": 0}

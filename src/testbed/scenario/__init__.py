@@ -16,8 +16,17 @@ from testbed.scenario.inputs import (
 )
 from testbed.scenario.links import AckLink, Link, Links, ObservationLink
 from testbed.scenario.load import load_scenario, parse_scenario
-from testbed.scenario.losses import BernoulliLoss, GilbertElliottLoss, Loss, MarkovLoss, NoLoss
+from testbed.scenario.loss_laws import (
+    BernoulliLoss,
+    FourStateLoss,
+    GilbertElliottLoss,
+    LossLaw,
+    MarkovLoss,
+    NoLoss,
+)
+from testbed.scenario.losses import Loss
 from testbed.scenario.models import Scenario
+from testbed.scenario.replays import ScriptedLoss, TraceLoss
 from testbed.scenario.schema import scenario_json_schema
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Tls, Transport
@@ -32,19 +41,23 @@ __all__ = [
     "EstimatorSpec",
     "ExponentialInput",
     "FeedbackInput",
+    "FourStateLoss",
     "GilbertElliottLoss",
     "Input",
     "Link",
     "Links",
     "Loss",
+    "LossLaw",
     "MarkovLoss",
     "NoLoss",
     "ObservationLink",
     "Scenario",
+    "ScriptedLoss",
     "SineInput",
     "System",
     "TableInput",
     "Tls",
+    "TraceLoss",
     "Transport",
     "Uncertainty",
     "UniformInput",

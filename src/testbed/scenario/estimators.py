@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
-from testbed.scenario.base import Count, Part, problem, sequence, shown
+from testbed.scenario.base import COUNT_MAX, Count, Part, problem, sequence, shown
 
 NAME_PATTERN = r"^[a-z][a-z0-9_-]{0,31}$"
 NAME_ALLOWED = "1 to 32 of a-z, 0-9, _ and -, a letter first"
@@ -27,7 +27,7 @@ class EstimatorSpec(Part):
     """An estimator. Keys of its table that are not fields here are its `options`."""
 
     model_config = ConfigDict(json_schema_extra=_schema)
-    reserved: ClassVar[tuple[str, ...]] = ("name", "kind", "acks", "until")
+    reserved: ClassVar[tuple[str, ...]] = ("name", "kind", "acks", "until", "buffer")
 
     name: Name = Field(description="Name in the results; unique.")
     kind: Name = Field(default_factory=_own_name, description="Which estimator it is; default its name.")
@@ -36,6 +36,13 @@ class EstimatorSpec(Part):
     )
     until: Count | None = Field(
         default=None, description="The last step at which it runs, 1 … steps; left out: the last step of all."
+    )
+    buffer: int | None = Field(
+        default=None,
+        ge=0,
+        le=COUNT_MAX,
+        description="Steps that it can go back when an observation or ACK comes late, 0 or more; left out: "
+        "20 where links can be late, else 0.",
     )
     options: dict[str, Any] = Field(default_factory=dict, description="Every other key of its table.")
 

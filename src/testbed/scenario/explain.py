@@ -13,6 +13,7 @@ from testbed.errors import did_you_mean
 from testbed.scenario.base import Part, shown
 from testbed.scenario.estimators import NAME_ALLOWED, NAME_PATTERN
 from testbed.scenario.models import Scenario
+from testbed.scenario.replays import WORD_PATTERN
 
 Target = type[BaseModel] | dict[str, type[BaseModel]] | None
 """What lies below a field: a model, the models of a union by their kind, or neither."""
@@ -181,8 +182,11 @@ def _allowed_plain(plain: Any, field: FieldInfo) -> str:
         return "an integer" if low is None else f"an integer, {limits}"
     if plain is float:
         return "a finite number" if low is None and above is None else limits
-    if any(getattr(entry, "pattern", None) == NAME_PATTERN for entry in metadata):
+    patterns = {getattr(entry, "pattern", None) for entry in metadata}
+    if NAME_PATTERN in patterns:
         return NAME_ALLOWED
+    if WORD_PATTERN in patterns:
+        return "a text of 0 and 1"
     most = next((entry.max_length for entry in metadata if isinstance(entry, annotated_types.MaxLen)), None)
     least = next((entry.min_length for entry in metadata if isinstance(entry, annotated_types.MinLen)), 0)
     return (

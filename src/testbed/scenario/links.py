@@ -3,11 +3,14 @@
 from typing import Literal
 
 from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from testbed.scenario.base import Part, problem, shown
-from testbed.scenario.durations import Duration
+from testbed.scenario.durations import Duration, parse_duration
 from testbed.scenario.impairments import Corrupt, Delay, Duplicate, Rate, Reorder
-from testbed.scenario.losses import Loss, NoLoss
+from testbed.scenario.loss_laws import NoLoss
+from testbed.scenario.losses import Loss
+from testbed.scenario.replays import ScriptedLoss, TraceLoss
 
 
 class Impairments(Part):
@@ -35,7 +38,32 @@ class Impairments(Part):
         return self
 
 
-class Link(Impairments):
+class SteppedImpairments(Impairments):
+    """A link of a run, whose packets belong to steps."""
+
+    deadline: Duration | None = Field(
+        default=None,
+        description="Time after sending within which a packet counts for its step, at most the period; left out: the "
+        "period. A later observation or ACK counts as late, a later control packet as lost.",
+    )
+    assumed: Loss | None = Field(
+        default=None,
+        description="What estimators take the losses for, lateness counted as loss; left out: what follows from the "
+        "other keys, or where there is no formula for it, a Markov chain fitted to a sample of the link.",
+    )
+
+    @property
+    def takes_time(self) -> bool:
+        """Whether a packet may arrive late, twice or spoilt, or meet a chain that is not moved by packets."""
+        stages = (self.slot, self.rate, self.delay, self.reorder, self.duplicate, self.corrupt)
+        return any(stage is not None for stage in stages)
+
+    def deadline_ns(self, period_ns: int) -> int:
+        """The deadline in nanoseconds."""
+        return period_ns if self.deadline is None else parse_duration(self.deadline)
+
+
+class Link(SteppedImpairments):
     """A link that carries packets one way."""
 
 
@@ -48,12 +76,16 @@ class ObservationLink(Link):
     )
 
 
-class AckLink(Impairments):
+class AckLink(SteppedImpairments):
     """What the estimators are told about the arrival of control packets."""
 
     mode: Literal["none", "perfect", "link"] = Field(
         default="none",
         description="none: nothing (UDP-like); perfect: everything, at once (TCP-like); link: over a link of its own.",
+    )
+
+    batch: int = Field(
+        default=1, ge=1, le=4096, description="Outcomes that an ACK carries: those of the last so many control packets."
     )
 
     @model_validator(mode="after")
@@ -64,9 +96,9 @@ class AckLink(Impairments):
             raise problem(
                 f"got kind {self.loss.kind!r} with mode {self.mode!r}; allowed: only with mode 'link'", "loss"
             )
-        for key in Impairments.model_fields:
+        for key, field in type(self).model_fields.items():
             value = getattr(self, key)
-            if key != "loss" and value != Impairments.model_fields[key].default:
+            if key not in ("mode", "loss") and value != field.default:
                 text = "a table" if isinstance(value, Part) else shown(value)
                 raise problem(f"got {text} with mode {self.mode!r}; allowed: only with mode 'link'", key)
         return self
@@ -78,3 +110,16 @@ class Links(Part):
     control: Link = Field(default_factory=Link, description="Controller to plant: u.")
     observation: ObservationLink = Field(default_factory=ObservationLink, description="Plant to estimators: y.")
     ack: AckLink = Field(default_factory=AckLink, description="Plant to estimators: which u were applied.")
+
+    def of_run(self, packets: int) -> "Links":
+        """For a run of so many packets a link: replayed losses with their law. A problem of validation if one ends."""
+        update = {}
+        for name in type(self).model_fields:
+            link: Impairments = getattr(self, name)
+            if isinstance(link.loss, (TraceLoss, ScriptedLoss)):
+                try:
+                    update[name] = link.model_copy(update={"loss": link.loss.of_run(packets)})
+                except PydanticCustomError as error:
+                    context = error.context or {}
+                    raise problem(context["text"], f"{name}.loss.{context['at']}") from None
+        return self.model_copy(update=update)

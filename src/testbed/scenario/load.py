@@ -1,7 +1,7 @@
 """Reading a scenario: the file, the tables it refers to, and the errors of both."""
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from testbed.scenario.base import shown
 from testbed.scenario.explain import explain
 from testbed.scenario.models import Scenario
 from testbed.scenario.table import read_table, read_text
+from testbed.scenario.trace_file import read_fates
 
 _TLS_FILES = ("ca", "certificate", "key", "client_certificate", "client_key")
 
@@ -67,7 +68,7 @@ def _resolve_files(tables: dict[str, Any], base_dir: Path) -> dict[str, Any]:
         result["input"] = _with_values("input", source, base_dir)
     if isinstance(result.get("links"), dict):
         result["links"] = {
-            name: _read_delays(name, link, base_dir) if isinstance(link, dict) else link
+            name: _read_link(name, link, base_dir) if isinstance(link, dict) else link
             for name, link in result["links"].items()
         }
     transport = result.get("transport")
@@ -82,6 +83,24 @@ def _resolve_files(tables: dict[str, Any], base_dir: Path) -> dict[str, Any]:
 def _absolute(table: dict[str, Any], keys: tuple[str, ...], base_dir: Path) -> dict[str, Any]:
     given = {key: table[key] for key in keys if isinstance(table.get(key), str) and table[key]}
     return {**table, **{key: str((base_dir / path).absolute()) for key, path in given.items()}}
+
+
+def _read_link(name: str, table: dict[str, Any], base_dir: Path) -> dict[str, Any]:
+    return _read_trace(name, _read_delays(name, table, base_dir), base_dir)
+
+
+def _read_trace(link: str, table: dict[str, Any], base_dir: Path) -> dict[str, Any]:
+    loss = table.get("loss")
+    if not isinstance(loss, dict) or loss.get("kind") != "trace":
+        return table
+
+    def read(path: Path, name: str) -> str:
+        word = read_fates(path, name).word
+        if not word:
+            raise UsageError(f"{name}: no packets; allowed: a row for each packet")
+        return word
+
+    return {**table, "loss": _read_in(f"links.{link}.loss", loss, base_dir, "fates", read)}
 
 
 def _read_delays(link: str, table: dict[str, Any], base_dir: Path) -> dict[str, Any]:
@@ -100,16 +119,30 @@ def _read_delays(link: str, table: dict[str, Any], base_dir: Path) -> dict[str, 
 
 def _with_values(where: str, source: dict[str, Any], base_dir: Path) -> dict[str, Any]:
     """The table with the rows of its ``file`` as its ``values``."""
-    if ("file" in source) == ("values" in source):
+
+    def read(path: Path, name: str) -> list[list[float]]:
+        try:
+            return read_table(path)
+        except UsageError as error:
+            raise UsageError(f"{name}: {error}") from None
+
+    return _read_in(where, source, base_dir, "values", read)
+
+
+def _read_in(
+    where: str, source: dict[str, Any], base_dir: Path, key: str, read: Callable[[Path, str], Any]
+) -> dict[str, Any]:
+    """The table with what is in its ``file`` under ``key``."""
+    if ("file" in source) == (key in source):
         given = "both" if "file" in source else "neither"
-        raise UsageError(f"{where}: got {given} of file and values; allowed: exactly one of file, values")
+        raise UsageError(f"{where}: got {given} of file and {key}; allowed: exactly one of file, {key}")
     if "file" not in source:
         return source
     file = source["file"]
     if not isinstance(file, str) or not file:
         raise UsageError(f"{where}.file: got {shown(file)}; allowed: the path of a CSV file")
     try:
-        values = read_table(base_dir / file)
+        content = read(base_dir / file, file)
     except UsageError as error:
-        raise UsageError(f"{where}.file: {file}: {error}") from None
-    return {**{key: value for key, value in source.items() if key != "file"}, "values": values}
+        raise UsageError(f"{where}.file: {error}") from None
+    return {**{name: value for name, value in source.items() if name != "file"}, key: content}

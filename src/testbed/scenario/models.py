@@ -6,6 +6,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from testbed.errors import did_you_mean
 from testbed.scenario.base import Count, Part, count, problem, shown, size
+from testbed.scenario.durations import parse_duration
 from testbed.scenario.estimators import EstimatorSpec
 from testbed.scenario.inputs import ConstantInput, FeedbackInput, Input, TableInput, check_channels
 from testbed.scenario.links import Links
@@ -68,6 +69,23 @@ class Scenario(Part):
             if spec.until is not None and steps is not None and spec.until > steps:
                 raise problem(f"got {spec.until}; allowed: 1 … {steps}, the steps of the scenario", f"[{i}].until")
         return specs
+
+    @field_validator("links")
+    @classmethod
+    def _check_links(cls, links: Links, info: ValidationInfo) -> Links:
+        clock: Clock | None = info.data.get("clock")
+        for name in Links.model_fields if clock is not None else ():
+            deadline = getattr(links, name).deadline
+            if clock is not None and deadline is not None and parse_duration(deadline) > clock.period_ns:
+                raise problem(f"got {deadline!r}; allowed: at most the period, {clock.period!r}", f"{name}.deadline")
+        observation = links.observation
+        if observation.on_loss == "noise" and observation.takes_time:
+            raise problem(
+                "got 'noise' on a link with a delay, rate, order, copies, bit errors or a clock of its own; "
+                "allowed there: nothing",
+                "observation.on_loss",
+            )
+        return links.of_run(info.data["steps"]) if "steps" in info.data else links
 
     @field_validator("input")
     @classmethod

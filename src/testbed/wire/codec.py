@@ -140,11 +140,12 @@ class _Slot:
 
 @dataclass(frozen=True)
 class _Layout:
-    """The arrays of a packet and the bytes they take; ``bare_mask``: a mask and nothing else."""
+    """The arrays of a packet and the bytes they take; ``bare_mask``: of this step a mask and nothing else."""
 
     slots: tuple[_Slot, ...]
     size: int
     bare_mask: bool
+    late: bool
 
 
 @dataclass(frozen=True)
@@ -248,7 +249,7 @@ class Decoder(Generic[M]):
         if recent is not None and (numbers := recent.numbers(payload)) is not None:
             header = _variant(recent.form.header, *numbers, recent.form.header.lane)
             self._check_range(header)
-            return header, self._arrays(recent.form.layout, payload, recent.end)
+            return header, self._content(header, recent.form.layout, payload, recent.end)
         if payload[:4] != MAGIC:
             raise Rejected("format", "the payload does not begin with NCS1")
         length = int.from_bytes(payload[4:8], "little")
@@ -262,7 +263,7 @@ class Decoder(Generic[M]):
             seq, step, lane = match.group(1, 2, 3)
             header = _variant(form.header, int(seq), int(step), int(lane))
             self._check_range(header)
-            arrays = self._arrays(form.layout, payload, 8 + length)
+            arrays = self._content(header, form.layout, payload, 8 + length)
         else:
             header = self._valid(payload[8 : 8 + length])
             if not isinstance(header, Packet):
@@ -273,7 +274,7 @@ class Decoder(Generic[M]):
             form = _Form(header, self._layout(header.arrays, header.lanes))
             if match is not None and len(self._forms) < _FORMS_MAX:
                 self._forms[key] = form
-            arrays = self._arrays(form.layout, payload, 8 + length)
+            arrays = self._content(header, form.layout, payload, 8 + length)
         if match is not None:
             tail_at = match.end(2)
             tail = payload[tail_at : 8 + length]
@@ -300,9 +301,11 @@ class Decoder(Generic[M]):
         if isinstance(self._outcome(messages[0]), Rejected):
             return None
         size, recent = len(messages[0]), self._recent.get(len(messages[0]))
-        if recent is None or not recent.form.layout.slots or size != recent.end + recent.form.layout.size:
+        if recent is None:
             return None
         like, layout = recent.form.header, recent.form.layout
+        if not layout.slots or layout.late or size != recent.end + layout.size:
+            return None
         numbers = recent.numbers_of(messages)
         first, last = like.FIRST_STEP, like.FIRST_STEP + self._sizes.steps - 1
         if not all(pair is not None and first <= pair[1] <= last for pair in numbers):
@@ -326,6 +329,12 @@ class Decoder(Generic[M]):
         if not 0 <= past < self._sizes.steps or header.lane + header.lanes > self._sizes.lanes:
             raise Rejected("range", f"step {header.step}, lanes {header.lane}…{header.lane + header.lanes - 1}")
 
+    def _content(self, header: Packet, layout: _Layout, payload: bytes, offset: int) -> Content:
+        arrays = self._arrays(layout, payload, offset)
+        if layout.late:
+            self._check_late(header, arrays)
+        return arrays
+
     def _arrays(self, layout: _Layout, payload: bytes, offset: int) -> Content:
         if len(payload) != offset + layout.size:
             raise Rejected("format", f"payload of {len(payload)} bytes, its arrays need {offset + layout.size}")
@@ -342,15 +351,26 @@ class Decoder(Generic[M]):
             raise Rejected("arrays", "the mask says that something arrived and nothing is there")
         return out
 
+    def _check_late(self, header: Packet, arrays: Content) -> None:
+        """Whether late arrays belong to earlier steps, the same in all lanes."""
+        steps = arrays["late_step"]
+        first = steps[0]
+        if (steps != first).any() or (first != np.floor(first)).any():
+            raise Rejected("range", "late_step is not the same whole number in all lanes")
+        if first.min() < header.FIRST_STEP or first.max() >= header.step or (np.diff(first) <= 0).any():
+            raise Rejected("range", f"late_step {first.tolist()} in step {header.step}: not earlier, or not in order")
+
     def _layout(self, arrays: tuple[ArrayEntry, ...], lanes: int) -> _Layout:
         """Where the arrays that a header lists lie. Raises Rejected for a list that the type does not allow."""
         slots: list[_Slot] = []
-        offset = 0
+        offset, late = 0, None
         for name, code, shape in arrays:
             rule = self._model.ARRAYS.get(name)
             if rule is None or any(slot.name == name for slot in slots):
                 raise Rejected("arrays", f"array {name!r} not expected")
-            if code != rule.dtype or shape != self._shape(rule.shape, lanes):
+            if "late" in rule.shape and len(shape) == len(rule.shape):
+                late = shape[rule.shape.index("late")] if late is None else late
+            if code != rule.dtype or shape != self._shape(rule.shape, lanes, late or 0):
                 raise Rejected("shape", f"{name} is {code} {shape}, expected {rule.dtype} {rule.shape}")
             slots.append(_Slot(name, _DTYPES[code], math.prod(shape), shape, offset))
             size = slots[-1].count * _DTYPES[code].itemsize
@@ -358,10 +378,16 @@ class Decoder(Generic[M]):
         names = {slot.name for slot in slots}
         if not self._required <= names:
             raise Rejected("arrays", f"missing {', '.join(sorted(self._required - names))}")
-        return _Layout(tuple(slots), offset, names == {"mask"})
+        if late is not None:
+            lacking = {name for name, rule in self._model.ARRAYS.items() if "late" in rule.shape} - names
+            if lacking or not 1 <= late <= self._sizes.steps:
+                raise Rejected("arrays", f"{late} late ones, missing {', '.join(sorted(lacking)) or 'none'}")
+            names = {name for name in names if "late" not in self._model.ARRAYS[name].shape}
+        return _Layout(tuple(slots), offset, names == {"mask"}, late is not None)
 
-    def _shape(self, symbols: tuple[str, ...], lanes: int) -> tuple[int, ...]:
-        return tuple(lanes if s == "lanes" else getattr(self._sizes, s) for s in symbols)
+    def _shape(self, symbols: tuple[str, ...], lanes: int, late: int) -> tuple[int, ...]:
+        free = {"lanes": lanes, "late": late}
+        return tuple(free[s] if s in free else getattr(self._sizes, s) for s in symbols)
 
 
 def all_finite(x: NDArray[np.float64]) -> bool:

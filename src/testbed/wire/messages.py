@@ -2,7 +2,8 @@
 
 A message is a JSON header, which is what the models describe, and the arrays that the header lists in ``arrays``.
 ``ARRAYS`` says for each type which arrays there may be, with their shapes in the symbols of theory.md: ``lanes`` is the
-field of that name; n, p, q are the sizes of state, observation and input.
+field of that name; n, p, q are the sizes of state, observation and input; ``late`` is any number from 1 on, the same
+for all arrays of a message.
 """
 
 from __future__ import annotations
@@ -72,6 +73,13 @@ _MASK = _bits(
     required=False,
     text="1 where the packet arrived in the lane; only behind a link; values elsewhere are 0, or noise",
 )
+_LATE_STEP = _floats(
+    "lanes",
+    "late",
+    required=False,
+    text="only behind a link: the earlier step k that a late one belongs to; the same in all lanes",
+)
+_LATE_MASK = _bits("lanes", "late", required=False, text="1 where it arrived in the lane since the step before")
 
 
 class Control(Packet):
@@ -98,6 +106,9 @@ class Observation(Packet):
             "lanes", "p", required=False, text='sensor noise v_k; only before a link with `on_loss = "noise"`'
         ),
         "mask": _MASK,
+        "late_y": _floats("lanes", "late", "p", required=False, text="observations of earlier steps, arrived late"),
+        "late_mask": _LATE_MASK,
+        "late_step": _LATE_STEP,
     }
 
 
@@ -108,6 +119,9 @@ class Acknowledgement(Packet):
     ARRAYS: ClassVar[dict[str, ArrayRule]] = {
         "nu": _bits("lanes", required=False, text="ν_{k−1}, 1 where the control packet was applied"),
         "mask": _MASK,
+        "late_nu": _bits("lanes", "late", required=False, text="ν_{k−1} of earlier steps k, learnt late"),
+        "late_mask": _LATE_MASK,
+        "late_step": _LATE_STEP,
     }
 
 
@@ -203,7 +217,8 @@ def messages_json_schema() -> dict[str, Any]:
             "JSON in UTF-8 (integers without a decimal point), padded with spaces to a multiple of 8; then the arrays "
             "in the order of 'arrays' (name, dtype, shape), C order, little-endian, each padded with zero bytes to a "
             "multiple of 8. 'x-arrays' says which arrays a type may have; 'lanes' there is the field, n, p, q are the "
-            "sizes of the state, the observation and the input."
+            "sizes of the state, the observation and the input; 'late' is any number from 1 on, the same for all "
+            "arrays of a message, which has all of those or none."
         ),
         "x-bundle": (
             "A payload is one message, or several: the four bytes 'NCSB'; their number as a little-endian uint32; then "

@@ -19,7 +19,8 @@ ACKS = ("none", "all", "subset", "late")
 ARRIVALS = ("all", "none", "random")
 CHAINS = ("bernoulli", "markov")
 HIDDEN = "gilbert-elliott"
-"""The kind of losses that not every estimator holds."""
+FOUR = "four-state"
+"""The kinds of losses that not every estimator holds."""
 
 
 def check(examples: int) -> settings:
@@ -37,6 +38,8 @@ class Channel:
     loss_bad: float
     start_good: float
 
+    states = (0, 1)
+
     def start(self, good: int) -> float:
         return self.start_good if good else 1.0 - self.start_good
 
@@ -48,6 +51,31 @@ class Channel:
         """P(ν | state)."""
         lost = self.loss_good if good else self.loss_bad
         return 1.0 - lost if nu else lost
+
+
+@dataclass(frozen=True)
+class FourStates:
+    """Good, pause, burst, isolated loss; p13 … as in netem's ``loss state``, and the law of the first state."""
+
+    p13: float
+    p31: float
+    p32: float
+    p23: float
+    p14: float
+    first: tuple[float, float, float, float]
+
+    states = (0, 1, 2, 3)
+
+    def start(self, state: int) -> float:
+        return self.first[state]
+
+    def move(self, state: int, to: int) -> float:
+        moves = {(0, 2): self.p13, (0, 3): self.p14, (1, 2): self.p23, (2, 0): self.p31, (2, 1): self.p32, (3, 0): 1.0}
+        stays = 1.0 - sum(chance for (before, _), chance in moves.items() if before == state)
+        return stays if to == state else moves.get((state, to), 0.0)
+
+    def fate(self, state: int, nu: int) -> float:
+        return float((state < 2) == bool(nu))
 
 
 @dataclass(frozen=True)
@@ -67,7 +95,7 @@ class System:
     recovery: float
     failure: float
     start: float
-    channel: Channel | None = None
+    channel: Channel | FourStates | None = None
 
     @property
     def n(self) -> int:
@@ -113,9 +141,9 @@ class System:
 
 
 @lru_cache(maxsize=4096)
-def _over_paths(channel: Channel, history: tuple[int, ...]) -> float:
+def _over_paths(channel: Channel | FourStates, history: tuple[int, ...]) -> float:
     total = 0.0
-    for path in product((0, 1), repeat=len(history)):
+    for path in product(channel.states, repeat=len(history)):
         chance = channel.start(path[0]) if path else 1.0
         for good, to in pairwise(path):
             chance *= channel.move(good, to)
@@ -188,7 +216,8 @@ def random_system(
         recovery, failure, start = rate, 1.0 - rate, rate
     else:
         recovery, failure, start = (float(rng.uniform(0.05, 0.95)) for _ in range(3))
-    channel = random_channel(rng) if chain == HIDDEN else None
+    kinds = {HIDDEN: random_channel, FOUR: random_four_states}
+    channel = kinds[chain](rng) if chain in kinds else None
     return System(
         A=A,
         B=rng.normal(size=(n, q)) * rng.uniform(0.3, 3.0),
@@ -216,6 +245,22 @@ def random_channel(rng: np.random.Generator) -> Channel:
     )
 
 
+def random_four_states(rng: np.random.Generator) -> FourStates:
+    """In one of three without isolated losses, or without pauses."""
+    kind = int(rng.integers(3))
+    good, burst = (rng.dirichlet((1.0, 1.0, 1.0)) for _ in range(2))
+    first = rng.dirichlet((1.0, 1.0, 1.0, 1.0)) * [1.0, kind != 2, 1.0, kind != 1]
+    first /= first.sum()
+    return FourStates(
+        p13=float(good[0]),
+        p31=float(burst[0]),
+        p32=0.0 if kind == 2 else float(burst[1]),
+        p23=float(rng.uniform(0.05, 0.95)),
+        p14=0.0 if kind == 1 else float(good[1]),
+        first=tuple(first.tolist()),
+    )
+
+
 def _losses(rng: np.random.Generator, system: System, steps: int, lanes: int) -> Ints:
     nu = np.zeros((steps, lanes), dtype=np.int64)
     for lane in range(lanes):
@@ -229,11 +274,14 @@ def _losses(rng: np.random.Generator, system: System, steps: int, lanes: int) ->
     return nu
 
 
-def _channel_losses(rng: np.random.Generator, channel: Channel, steps: int) -> list[int]:
-    good, nu = int(rng.random() < channel.start_good), []
+def _channel_losses(rng: np.random.Generator, channel: Channel | FourStates, steps: int) -> list[int]:
+    def drawn(chances: list[float]) -> int:
+        return int(rng.choice(channel.states, p=chances))
+
+    state, nu = drawn([channel.start(s) for s in channel.states]), []
     for _ in range(steps):
-        nu.append(int(rng.random() < channel.fate(good, 1)))
-        good = int(rng.random() < channel.move(good, 1))
+        nu.append(int(rng.random() < channel.fate(state, 1)))
+        state = drawn([channel.move(state, to) for to in channel.states])
     return nu
 
 

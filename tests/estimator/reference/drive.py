@@ -7,18 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from estimator.reference.cases import Floats, System, Trial
+from estimator.reference.cases import Floats, FourStates, System, Trial
+from testbed.channel.four_state import four_state
 from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain
 from testbed.estimator.bounds import Bounds
 from testbed.estimator.model import Ack, Model
 from testbed.estimator.registry import create
 
 
-def losses_of(system: System) -> Chain | GilbertElliott:
+def losses_of(system: System) -> LossModel:
     c = system.channel
     if c is None:
         return Chain(system.recovery, system.failure, system.start)
+    if isinstance(c, FourStates):
+        return four_state(c.p13, c.p31, c.p32, c.p23, c.p14, c.first)
     return GilbertElliott.of(c.to_bad, c.to_good, c.loss_good, c.loss_bad, c.start_good)
 
 

@@ -1,6 +1,6 @@
-"""GPB and IMM under Gilbert–Elliott control losses by their definitions: tables of parts, weights as numbers.
+"""GPB and IMM under control losses with a hidden state by their definitions: tables of parts, weights as numbers.
 
-A weight is a pair, joint with the state of the channel that the next packet meets: (bad, good).
+A weight has an entry for each state of the channel, joint with that being the one that the next packet meets.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from itertools import groupby
 import numpy as np
 from scipy.stats import multivariate_normal
 
-from estimator.reference.cases import Bools, Channel, Floats, System
+from estimator.reference.cases import Bools, Channel, Floats, FourStates, System
 from estimator.reference.gaussian import Estimate
 
 _Part = tuple[tuple[int, ...], Floats, Floats, Floats]
-"""Bits, oldest first; weights (2,); mean; covariance."""
+"""Bits, oldest first; weights (S,); mean; covariance."""
 
 
 def gpb(
@@ -23,7 +23,7 @@ def gpb(
     """Estimates of steps 1 … K of one lane; known[k − 1]: {j: ν_j} of what is known at step k. Order 0 is AOE."""
     channel = system.channel
     assert channel is not None
-    parts: list[_Part] = [((), np.array([channel.start(0), channel.start(1)]), system.x0_mean, system.P0)]
+    parts: list[_Part] = [((), np.array([channel.start(s) for s in channel.states]), system.x0_mean, system.P0)]
     estimates = []
     for k in range(1, len(u) + 1):
         children: list[_Part] = []
@@ -55,16 +55,17 @@ def imm(system: System, u: Floats, y: Floats, arrived: Bools, known: dict[int, i
     """The textbook's four steps with the modes (state, ν); known: {j: ν_j} of the packets known in time."""
     channel = system.channel
     assert channel is not None
-    modes = [(s, nu) for s in (0, 1) for nu in (0, 1)]
+    modes = [(s, nu) for s in channel.states for nu in (0, 1)]
+    count = len(modes)
     prior = np.array([channel.start(s) * channel.fate(s, nu) for s, nu in modes])
     moves = np.array([[channel.move(s, to) * channel.fate(to, nu) for to, nu in modes] for s, _ in modes])
-    weights, means, covs = None, np.array([system.x0_mean] * 4), np.array([system.P0] * 4)
+    weights, means, covs = None, np.array([system.x0_mean] * count), np.array([system.P0] * count)
     estimates = []
     for k in range(1, len(u) + 1):
-        joint = np.outer(np.full(4, 0.25), prior) if weights is None else weights[:, None] * moves
+        joint = np.outer(np.full(count, 1.0 / count), prior) if weights is None else weights[:, None] * moves
         weights = joint.sum(axis=0)
         share = joint / np.where(weights > 0.0, weights, 1.0)
-        mixed = [_mixture(share[:, j], means, covs) for j in range(4)]
+        mixed = [_mixture(share[:, j], means, covs) for j in range(count)]
         for j, (_, nu) in enumerate(modes):
             mean, cov = mixed[j]
             mean, cov = system.A @ mean + nu * system.B @ u[k - 1], system.A @ cov @ system.A.T + system.Q
@@ -79,10 +80,10 @@ def imm(system: System, u: Floats, y: Floats, arrived: Bools, known: dict[int, i
     return estimates
 
 
-def _after(channel: Channel, weights: Floats, nu: int) -> Floats:
+def _after(channel: Channel | FourStates, weights: Floats, nu: int) -> Floats:
     """Joint with ν and with the state of the packet after."""
-    met = [weights[s] * channel.fate(s, nu) for s in (0, 1)]
-    return np.array([met[0] * channel.move(0, to) + met[1] * channel.move(1, to) for to in (0, 1)])
+    met = [weights[s] * channel.fate(s, nu) for s in channel.states]
+    return np.array([sum(met[s] * channel.move(s, to) for s in channel.states) for to in channel.states])
 
 
 def _observed(system: System, part: _Part, y: Floats) -> _Part:

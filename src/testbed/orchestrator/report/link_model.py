@@ -10,10 +10,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from testbed.analysis.bursts import run_law
 from testbed.channel.chains import chain_of
-from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.hidden import Hidden
 from testbed.channel.law import LossModel
 from testbed.orchestrator.summary import LinkFigures, Summary
-from testbed.scenario import Loss
+from testbed.scenario import Loss, ScriptedLoss, TraceLoss
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ _LOSS: TypeAdapter[Loss] = TypeAdapter(Loss)
 
 
 def expected_links(summary: Summary, scenario_toml: str) -> dict[str, Expected]:
-    """What is expected of each link that sent a packet and whose loss is one of the scenario's loss models.
+    """What is expected of each link that sent a packet and whose losses are drawn by a law.
 
     Raises:
         tomllib.TOMLDecodeError: the scenario is not TOML.
@@ -39,24 +39,24 @@ def expected_links(summary: Summary, scenario_toml: str) -> dict[str, Expected]:
     expected = {}
     for name, figures in summary.links.items():
         try:
-            chain = chain_of(_LOSS.validate_python(tables.get(name, {}).get("loss", {"kind": "none"})))
+            loss = _LOSS.validate_python(tables.get(name, {}).get("loss", {"kind": "none"}))
         except ValidationError:
             continue
-        if figures.sent and summary.lanes:
-            expected[name] = _expected(chain, figures, summary.lanes)
+        if figures.sent and summary.lanes and not isinstance(loss, (TraceLoss, ScriptedLoss)):
+            expected[name] = _expected(chain_of(loss), figures, summary.lanes)
     return expected
 
 
 def _expected(losses: LossModel, figures: LinkFigures, lanes: int) -> Expected:
-    """Lanes are independent; within a lane packets j apart have correlation coupling · memory^j.
+    """Lanes are independent; within a lane packets are correlated as the model says.
 
     The spread is that of the stationary law. Bursts of a chain of arrivals are geometric with parameter `recovery`;
     those that the end of the run cuts short are not allowed for.
     """
-    arrival, spread = _arrivals(losses, steps=max(1, round(figures.sent / lanes)))
+    arrival, variance = losses.share_moments(max(1, round(figures.sent / lanes)))
     return Expected(
         loss_rate=1.0 - arrival,
-        loss_rate_deviation=spread / math.sqrt(lanes),
+        loss_rate_deviation=math.sqrt(max(0.0, variance) / lanes),
         mean_burst=None if losses.never_loses else losses.mean_burst,
         mean_burst_deviation=_burst_spread(losses, figures.transitions.delivered_lost),
     )
@@ -64,20 +64,8 @@ def _expected(losses: LossModel, figures: LinkFigures, lanes: int) -> Expected:
 
 def _burst_spread(losses: LossModel, bursts: int) -> float | None:
     """Standard deviation of the mean length of that many bursts."""
-    if isinstance(losses, GilbertElliott):
+    if isinstance(losses, Hidden):
         law = run_law(losses, False)
         return math.sqrt(law.variance_of_mean / bursts) if law is not None and bursts else None
     recovery = losses.recovery
     return math.sqrt((1.0 - recovery) / bursts) / recovery if recovery and bursts else None
-
-
-def _arrivals(losses: LossModel, steps: int) -> tuple[float, float]:
-    """Mean share of arrivals in one lane over `steps` steps, and its standard deviation."""
-    states = losses.states if isinstance(losses, GilbertElliott) else losses
-    leaving = states.recovery + states.failure
-    rho = 1.0 - leaving
-    geometric = (1.0 - rho**steps) / leaving  # Σ ρ^j, j = 0 … steps − 1
-    correlated = rho * (steps - geometric) / leaving  # Σ (steps − j) ρ^j, j = 1 … steps − 1
-    variance = losses.arrival * (1.0 - losses.arrival) * (steps + 2.0 * losses.coupling * correlated) / steps**2
-    mean = losses.arrival + (losses.first_arrival - losses.arrival) * geometric / steps
-    return mean, math.sqrt(max(0.0, variance))

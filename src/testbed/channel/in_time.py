@@ -1,0 +1,111 @@
+"""The law of what arrives in time, as estimators take it for the losses: lateness counts as loss."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from testbed.channel.carriers import carriers_of
+from testbed.channel.chains import chain_of
+from testbed.channel.delay import cdf_of
+from testbed.channel.gilbert_elliott import GilbertElliott
+from testbed.channel.hidden import Hidden, HiddenChain
+from testbed.channel.law import LossModel
+from testbed.channel.loss import Chain, LossCounts
+from testbed.channel.steps import SteppedLink
+from testbed.numerics.lanes import Floats
+from testbed.scenario.durations import parse_duration
+from testbed.scenario.impairments import ConstantDelay
+from testbed.scenario.links import SteppedImpairments
+
+SAMPLED = 20_000
+_SEED = 20_000
+_BYTES = 256
+
+
+def law_in_steps(link: SteppedImpairments, period_ns: int) -> LossModel:
+    """The losses of a link as they are seen from step to step, a packet a period.
+
+    ``assumed`` where it is given. Otherwise exact, but for a clock whose slots do not divide the period (there, the
+    mean over their phases), where packets do not depend on each other but through the chain; with a bottleneck or with
+    delays in order, the Markov chain that fits the counts of a sample of 20,000 packets.
+    """
+    if link.assumed is not None:
+        return chain_of(link.assumed)
+    if not link.takes_time:
+        return chain_of(link.loss)
+    if has_formula(link):
+        return _exact(link, period_ns)
+    return _sampled(link, period_ns)
+
+
+def has_formula(link: SteppedImpairments) -> bool:
+    """Whether the fates of packets depend on each other through the chain of the losses alone."""
+    delay = link.delay
+    return link.rate is None and (delay is None or isinstance(delay, ConstantDelay) or not delay.in_order)
+
+
+def _exact(link: SteppedImpairments, period_ns: int) -> LossModel:
+    losses = chain_of(link.loss)
+    arrives = _arrives_in_time(link, link.deadline_ns(period_ns))
+    if link.slot is None and arrives == 1.0:
+        return losses
+    initial, moves, loss = _hidden_form(losses)
+    if link.slot is not None:
+        moves = _moved_by_time(moves, period_ns, parse_duration(link.slot))
+    loss = 1.0 - (1.0 - loss) * arrives
+    if isinstance(losses, Chain | GilbertElliott):
+        states = Chain(float(moves[0, 1]), float(moves[1, 0]), float(initial[1]))
+        return _simplest(GilbertElliott(states, float(loss[1]), float(loss[0])))
+    return _simplest(HiddenChain(tuple(initial), tuple(map(tuple, moves)), tuple(loss)))
+
+
+def _simplest(losses: Hidden) -> LossModel:
+    chain = losses.as_chain
+    return losses if chain is None else chain
+
+
+def _hidden_form(losses: LossModel) -> tuple[Floats, Floats, Floats]:
+    """(initial, transition, loss) of the states; of two of them the bad one first."""
+    if isinstance(losses, Chain):
+        losses = GilbertElliott(losses, 0.0, 1.0)
+    return losses.initial, losses.transition, losses.loss
+
+
+def _moved_by_time(moves: Floats, period_ns: int, slot_ns: int) -> Floats:
+    """The moves from packet to packet: as many as slots begin between them, on average over the phases."""
+    whole, rest = divmod(period_ns, slot_ns)
+    share = rest / slot_ns
+    fewer = np.linalg.matrix_power(moves, whole)
+    return np.asarray((1.0 - share) * fewer + share * (fewer @ moves))
+
+
+def _arrives_in_time(link: SteppedImpairments, deadline_ns: int) -> float:
+    """P(a copy arrives intact before the deadline | the packet is not lost)."""
+    cdf = (lambda ns: float(ns >= 0)) if link.delay is None else cdf_of(link.delay)
+    held, by = (0.0, 0) if link.reorder is None else (link.reorder.chance, parse_duration(link.reorder.by))
+
+    def before(ns: int) -> float:
+        return (1.0 - held) * cdf(ns) + held * cdf(ns - by)
+
+    intact = 1.0 if link.corrupt is None else 1.0 - link.corrupt.chance
+    arrives = intact * before(deadline_ns)
+    if link.duplicate is not None:
+        after = parse_duration(link.duplicate.after, zero=True)
+        arrives += link.duplicate.chance * (1.0 - intact) * intact * before(deadline_ns - after)
+    return arrives
+
+
+@lru_cache(maxsize=16)
+def _sampled(link: SteppedImpairments, period_ns: int) -> Chain:
+    carriers = carriers_of(link, _SEED, "law", 0, 1)
+    stepped, counts = SteppedLink(carriers, _BYTES, period_ns, link.deadline_ns(period_ns)), LossCounts()
+    for number in range(SAMPLED):
+        counts.count(0, bool(stepped.send(number).in_time[0]))
+    (bad, recovered), (failed, good) = counts.transitions
+    if not counts.dropped:
+        return Chain.lossless()
+    if not counts.delivered:
+        return Chain.bernoulli(0.0)
+    return Chain.markov(recovered / max(1, bad + recovered), failed / max(1, failed + good))

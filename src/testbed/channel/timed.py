@@ -1,0 +1,113 @@
+"""A link that takes time, for a block of lanes: from the packets sent to the arrays that it delivers, step by step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from testbed.channel.books import Books
+from testbed.channel.loss import LossCounts
+from testbed.channel.steps import SteppedLink
+from testbed.numerics.lanes import Bools
+from testbed.scenario.links import Impairments
+
+Arrays = dict[str, NDArray[Any]]
+
+_KEEP_BYTES = 64_000_000
+_KEEP_LEAST = 64
+
+
+class TimedBlock:
+    """Keeps what is under way, and hands it over when it arrives.
+
+    What is kept is bounded: what comes more than ``keep`` packets late is dropped and counted as "stale".
+    """
+
+    def __init__(self, link: SteppedLink, lanes: int, name: str, *, first_step: int, batch: int = 1) -> None:
+        """name: of the content. first_step: step of packet 0. batch: outcomes that a packet carries (ACKs)."""
+        self._link, self._lanes, self._name = link, lanes, name
+        self._first_step, self._batch = first_step, batch
+        self._contents: dict[int, NDArray[Any]] = {}
+        self._known: dict[int, Bools] = {}
+        self._keep = 0
+        self._late = 0
+        self._stale = 0
+        self.counts = LossCounts()
+        """Of what arrived in time."""
+
+    @property
+    def books(self) -> Books:
+        """Of packets, all lanes together. What came late is delivered, what came too late for that is dropped."""
+        books = self._link.books
+        books.delivered -= self._stale
+        books.dropped["stale"] += self._stale
+        return books
+
+    @property
+    def late(self) -> int:
+        """Packets that arrived after their deadline, and were handed over."""
+        return self._late
+
+    def change(self, settings: Impairments) -> None:
+        self._link.change(settings)
+
+    def in_time(self, number: int) -> Bools:
+        """Send a packet of which only what is in time is of use; the rest is late, and not handed over."""
+        arrivals = self._link.send(number)
+        self._late += sum(int(np.count_nonzero(lanes)) for _, lanes in arrivals.late)
+        self.counts.count(0, arrivals.in_time if self._lanes > 1 else bool(arrivals.in_time[0]))
+        return arrivals.in_time
+
+    def pass_on(self, number: int, content: NDArray[Any]) -> Arrays:
+        """Send packet ``number``, content (M, …), and what is delivered before the next: arrays of a message."""
+        self._remember(number, content)
+        arrivals = self._link.send(number)
+        self.counts.count(0, arrivals.in_time if self._lanes > 1 else bool(arrivals.in_time[0]))
+        fresh: dict[int, Bools] = {}
+        for packet, lanes in [*arrivals.late, (number, arrivals.in_time)]:
+            if packet < number:
+                self._late += int(np.count_nonzero(lanes))
+                if packet not in self._contents:
+                    self._stale += int(np.count_nonzero(lanes))
+            for one in range(max(packet - self._batch + 1, 0), packet + 1):
+                if one not in self._contents:
+                    continue
+                new = lanes & ~self._known[one]
+                if new.any():
+                    self._known[one] |= new
+                    fresh[one] = fresh.get(one, np.zeros(self._lanes, dtype=np.bool_)) | new
+        mask = fresh.pop(number, np.zeros(self._lanes, dtype=np.bool_))
+        out: Arrays = {"mask": mask.astype(np.uint8)}
+        if mask.any():
+            out = {self._name: _blanked(content, mask), **out}
+        return {**out, **self._late_arrays(sorted(fresh.items()))}
+
+    def _late_arrays(self, late: list[tuple[int, Bools]]) -> Arrays:
+        if not late:
+            return {}
+        steps = np.array([float(number + self._first_step) for number, _ in late])
+        return {
+            f"late_{self._name}": np.stack([_blanked(self._contents[n], lanes) for n, lanes in late], axis=1),
+            "late_mask": np.stack([lanes for _, lanes in late], axis=1).astype(np.uint8),
+            "late_step": np.tile(steps, (self._lanes, 1)),
+        }
+
+    def _remember(self, number: int, content: NDArray[Any]) -> None:
+        if not self._keep:
+            self._keep = max(_KEEP_LEAST, self._batch, _KEEP_BYTES // max(1, content.nbytes))
+        self._contents[number] = np.array(content)
+        self._known[number] = np.zeros(self._lanes, dtype=np.bool_)
+        old = number - self._keep
+        self._contents.pop(old, None)
+        self._known.pop(old, None)
+
+
+def _blanked(content: NDArray[Any], lanes: Bools) -> NDArray[Any]:
+    """The content with zeros in the other lanes."""
+    if lanes.all():
+        return content
+    out = np.array(content)
+    out[~lanes] = 0
+    return out
