@@ -8,7 +8,8 @@ from testbed.errors import UsageError
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.impairments import ConstantDelay, Delay, NormalDelay, Rate, Reorder, UniformDelay
 from testbed.scenario.links import Impairments
-from testbed.scenario.losses import BernoulliLoss, GilbertElliottLoss, Loss, MarkovLoss, NoLoss
+from testbed.scenario.loss_laws import BernoulliLoss, GilbertElliottLoss, MarkovLoss, NoLoss
+from testbed.scenario.losses import Loss
 
 _NO_LIMIT = 1_000_000
 """Packets; netem's own limit of 1000 would drop at high rates."""

@@ -10,7 +10,7 @@ from typing import TextIO
 from testbed.channel.kernel.bits import with_flipped_bit
 from testbed.channel.pipeline import Pipeline
 from testbed.channel.schedule import Schedule
-from testbed.channel.trace import HEADER
+from testbed.scenario.trace_file import HEADER
 
 _BATCH = 64
 _OVERDUE_NS = 1_000_000
