@@ -12,6 +12,7 @@ import os
 import signal
 import socket
 import sys
+from contextlib import suppress
 
 from testbed.channel.kernel.control import Control
 from testbed.channel.kernel.ending import end_within
@@ -24,6 +25,8 @@ from testbed.channel.kernel.namespaces import (
     sharp_timers,
 )
 from testbed.channel.kernel.plan import Hosts, Plan, Refused
+
+_NICE = -10
 
 
 def main(fd: int, owner: int) -> int:
@@ -44,6 +47,8 @@ def main(fd: int, owner: int) -> int:
         control.send({"refused": str(refused)})
         return 1
     sharp_timers()
+    with suppress(OSError):  # without root rights as the others
+        os.setpriority(os.PRIO_PROCESS, 0, _NICE)
     gc.freeze()
     gc.disable()
     try:
