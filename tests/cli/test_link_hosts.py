@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,20 @@ def test_exit_code_and_end_of_both_commands(testbed: Command) -> None:
     assert "a: killed by SIGKILL" in killed.out
 
 
+@pytest.mark.root
+def test_the_books_are_printed_after_an_interrupt(testbed: Command, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "testbed", "link", "hosts", "s.toml", "--link", "control", "--json"]
+    command += ["--", "sh", "-c", "echo started; exec sleep 1000"]
+    with subprocess.Popen(command, stdout=-1, stderr=-1, text=True, start_new_session=True, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "started\n"
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "testbed: interrupted\n")
+    assert json.loads(out)["exit_codes"] == {"a": None}
+    assert json.loads(out)["forward"]["sent"] == 0
+
+
 @pytest.mark.parametrize(
     ("options", "error"),
     [
@@ -60,6 +75,7 @@ def test_exit_code_and_end_of_both_commands(testbed: Command) -> None:
         (("--link", "control", "--backend", "netm"), "--backend netm: no such backend; allowed: tun, netem; did you"),
         (("--link", "control", "--head-start", "soon"), "--head-start soon: allowed: a duration such as '500 ms'"),
         (("--link", "control", "--congestion", "no"), "congestion: got 'no'; allowed: "),
+        (("--link", "control", "--trace", "no/such/t.csv"), "cannot write no/such/t.csv: no such file or directory"),
         (("--link", "control", "--mtu", "1"), "mtu: got 1; allowed: 576 … 65535"),
     ],
 )  # fmt: skip

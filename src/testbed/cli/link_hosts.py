@@ -6,6 +6,7 @@ import json as json_format
 import shlex
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,12 +19,15 @@ if TYPE_CHECKING:
     from testbed.channel.kernel.hosts import Backend, Hosts, Way
     from testbed.scenario import Scenario
 
+_INTERRUPTED = 130
 _BACKENDS: tuple[Backend, ...] = ("tun", "netem")
 
 
 def hosts(
     scenario: Annotated[Path, typer.Argument(metavar="SCENARIO.toml", help="The scenario.")],
-    command: Annotated[list[str], typer.Argument(metavar="-- COMMAND...", help="What runs in host a.")],
+    command: Annotated[
+        list[str], typer.Argument(metavar="COMMAND...", help="What runs in host a; after the options and --.")
+    ],
     name: Annotated[str, typer.Option("--link", metavar="LINK", help="Its link that impairs the way from a to b.")],
     back: Annotated[
         str | None, typer.Option(metavar="LINK", help="The link that impairs the way back; default: nothing does.")
@@ -48,7 +52,7 @@ def hosts(
 
     Host a is 10.0.0.1 and b 10.0.0.2; they reach each other and nothing else. Files, users and devices are those of
     this machine. When COMMAND has ended, all that runs in the hosts is ended, and the books of the link are printed.
-    The exit code is that of COMMAND.
+    The exit code is that of COMMAND, or 130 after Ctrl-C.
     """
     from testbed.channel.kernel.hosts import Hosts
     from testbed.scenario import load_scenario, parse_duration
@@ -70,12 +74,13 @@ def hosts(
         if b is not None:
             server = pair.b.popen(_words(b))
             time.sleep(wait_s)
-        codes["a"] = pair.a.popen(command).wait()
+        client = pair.a.popen(command)
+        with suppress(KeyboardInterrupt):  # Ctrl-C reaches the commands too
+            codes["a"] = client.wait()
         if server is not None:
             codes["b"] = server.poll()
     _show(pair, name, back, codes, json)
-    if codes["a"]:
-        raise typer.Exit(_exit_code(codes["a"]))
+    raise typer.Exit(_INTERRUPTED if codes["a"] is None else _exit_code(codes["a"]))
 
 
 def _ways(

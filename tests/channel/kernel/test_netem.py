@@ -14,6 +14,8 @@ from testbed.errors import UsageError
 
 GE = {"kind": "gilbert-elliott", "to_bad": 0.02, "to_good": 0.25, "loss_good": 0.001, "loss_bad": 0.7}
 
+FOUR = {"kind": "four-state", "to_burst": 0.02, "to_good": 0.4, "to_pause": 0.3, "from_pause": 0.5, "to_isolated": 0.01}
+
 
 @pytest.mark.parametrize(
     ("settings", "words"),
@@ -27,6 +29,7 @@ GE = {"kind": "gilbert-elliott", "to_bad": 0.02, "to_good": 0.25, "loss_good": 0
         ),
         ({"loss": GE}, "limit 1000000 loss gemodel 2% 25% 70% 0.1%"),
         ({"loss": {**GE, "start_good": 1.0}}, "limit 1000000 loss gemodel 2% 25% 70% 0.1%"),
+        ({"loss": FOUR}, "limit 1000000 loss state 2% 40% 30% 50% 1%"),
         ({"delay": {"kind": "constant", "by": "2.5 ms"}}, "limit 1000000 delay 2500000ns"),
         ({"delay": {"kind": "uniform", "low": "0 s", "high": "30 ms"}}, "limit 1000000 delay 15000000ns 15000000ns"),
         (
@@ -57,6 +60,8 @@ def test_words(settings: dict[str, Any], words: str) -> None:
         ({"loss": GE, "clock": "time", "slot": "10 ms"}, "clock"),
         ({"loss": {"kind": "markov", "recovery": 0.5, "failure": 0.1, "start": 0.5}}, "loss.start"),
         ({"loss": {**GE, "start_good": 0.0}}, "loss.start_good"),
+        ({"loss": {**FOUR, "start": [1.0, 0.0, 0.0, 0.0]}}, "loss.start"),
+        ({"loss": {"kind": "scripted", "lost": [3]}}, "loss.kind"),
         ({"delay": {"kind": "log-normal", "median": "5 ms", "sigma": 0.5}}, "delay.kind"),
         ({"delay": {"kind": "table", "values": [1.0, 2.0]}}, "delay.kind"),
         ({"delay": {"kind": "uniform", "low": "1 ms", "high": "2 ms", "in_order": True}}, "delay.in_order"),

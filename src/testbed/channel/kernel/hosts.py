@@ -40,6 +40,12 @@ class Way:
     trace: Path | None = None
 
     def as_json(self) -> dict[str, Any]:
+        """Raises UsageError where the trace cannot be written."""
+        if self.trace is not None:
+            try:
+                self.trace.touch()
+            except OSError as error:
+                raise UsageError(f"cannot write {self.trace}: {(error.strerror or str(error)).lower()}") from None
         trace = None if self.trace is None else str(self.trace.resolve())
         return {"impairments": _dumped(self.impairments), "component": self.component, "trace": trace}
 

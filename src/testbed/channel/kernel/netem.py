@@ -8,7 +8,7 @@ from testbed.errors import UsageError
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.impairments import ConstantDelay, Delay, NormalDelay, Rate, Reorder, UniformDelay
 from testbed.scenario.links import Impairments
-from testbed.scenario.loss_laws import BernoulliLoss, GilbertElliottLoss, MarkovLoss, NoLoss
+from testbed.scenario.loss_laws import BernoulliLoss, FourStateLoss, GilbertElliottLoss, MarkovLoss, NoLoss
 from testbed.scenario.losses import Loss
 
 _NO_LIMIT = 1_000_000
@@ -57,7 +57,12 @@ def _loss(loss: Loss) -> list[str]:
             raise _refusal("loss.start_good", f"{loss.start_good:g}", "none; its chains start in the good state")
         chances = (loss.to_bad, loss.to_good, loss.loss_bad, loss.loss_good)
         return ["loss", "gemodel", *map(_percent, chances)]
-    raise _refusal("loss.kind", repr(loss.kind), "'none', 'bernoulli', 'markov', 'gilbert-elliott'")
+    if isinstance(loss, FourStateLoss):
+        if loss.start is not None:
+            raise _refusal("loss.start", "probabilities", "none; its chains start in the good state")
+        chances = (loss.to_burst, loss.to_good, loss.to_pause, loss.from_pause, loss.to_isolated)
+        return ["loss", "state", *map(_percent, chances)]
+    raise _refusal("loss.kind", repr(loss.kind), "'none', 'bernoulli', 'markov', 'gilbert-elliott', 'four-state'")
 
 
 def _delay(delay: Delay) -> list[str]:
