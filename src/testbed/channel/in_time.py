@@ -15,6 +15,7 @@ from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain, LossCounts
 from testbed.channel.steps import SteppedLink
 from testbed.numerics.lanes import Floats
+from testbed.scenario import ScriptedLoss, TraceLoss
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.impairments import ConstantDelay
 from testbed.scenario.links import SteppedImpairments
@@ -33,6 +34,8 @@ def law_in_steps(link: SteppedImpairments, period_ns: int) -> LossModel:
     """
     if link.assumed is not None:
         return chain_of(link.assumed)
+    if isinstance(link.loss, TraceLoss | ScriptedLoss):
+        link = link.model_copy(update={"loss": link.loss.law})
     if not link.takes_time:
         return chain_of(link.loss)
     if has_formula(link):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from testbed.channel.processes import FateProcess, process_of
+from testbed.channel.processes import FateProcess, goes_on, process_of
 from testbed.numerics.streams import Stream
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.links import Impairments
@@ -31,9 +31,7 @@ class Losses:
         """Other losses from now on: the streams go on, and so does the state where there are as many as before."""
         before = self._process
         self._set(settings)
-        if self._process.states == before.states:
-            self._process.state = before.state
-        elif self._slot >= 0:
+        if not goes_on(self._process, before) and self._slot >= 0:
             self._slot -= 1  # a first state of the new kind, in this slot
 
     def _set(self, settings: Impairments) -> None:

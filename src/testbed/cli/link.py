@@ -91,6 +91,27 @@ def fit(
     show(str(trace), fitted, fates.duplicates)
 
 
+@app.command(name="set")
+def set_(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run that goes.")],
+    name: Annotated[str, typer.Argument(metavar="LINK", help="control, observation or ack.")],
+    settings: Annotated[
+        list[str], typer.Argument(metavar="KEY=VALUE…", help="Keys of the link's table, such as loss.failure=0.4.")
+    ],
+) -> None:
+    """Change a link of a run that goes: other values for keys of its table, from the next step on.
+
+    The random streams go on, and nothing in flight is lost. A value "none" removes a stage. The step from which the
+    change holds is printed, and is in the results of the run.
+    """
+    from testbed.orchestrator.running import ask
+    from testbed.scenario.changes import parse_setting, together
+
+    change = together([parse_setting(text) for text in settings])
+    answer = ask(run, {"link": link_name(name), "set": change})
+    typer.echo(f"{name}: from step {answer['step']} on")
+
+
 def _shown(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
 

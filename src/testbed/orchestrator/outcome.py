@@ -61,6 +61,7 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
             "estimators": estimators,
             "bounds": bounds,
             "links": links,
+            "events": sorted((e for e in conductor.events if e.step <= collector.completed), key=lambda e: e.step),
             "checks": checks,
             "rejected": rejected,
             "timing": timing,

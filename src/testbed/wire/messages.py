@@ -176,6 +176,14 @@ class Command(Message):
     action: Literal["stop"]
 
 
+class Change(Message):
+    """An order to one link: from step ``step`` on, some keys of its table have other values."""
+
+    type: Literal["change"] = "change"
+    step: Count
+    set: Annotated[dict[str, Any], Field(description="keys of the link's table as in a scenario; 'none' removes one")]
+
+
 class Status(Message):
     """A role's word to the orchestrator."""
 
@@ -195,6 +203,7 @@ MESSAGES: dict[str, type[Message]] = {
     "bounds": BoundsMessage,
     "clock": ClockMessage,
     "command": Command,
+    "change": Change,
     "status": Status,
 }
 

@@ -94,6 +94,7 @@ def test_the_wire_loses_duplicates_and_corrupts_the_packets_of_the_pipeline() ->
 def test_trace_has_every_packet_with_its_delay(tmp_path: Path) -> None:
     settings = {"loss": LOSS, "delay": {"kind": "constant", "by": "20 ms"}}
     with hosts(link(**settings), trace=tmp_path / "t.csv") as pair:
+        Receiver(pair.b)
         send(pair, 300)
     with (tmp_path / "t.csv").open() as file:
         rows = list(csv.DictReader(file))

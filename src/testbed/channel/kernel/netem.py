@@ -55,8 +55,7 @@ def _loss(loss: Loss) -> list[str]:
     if isinstance(loss, GilbertElliottLoss):
         if loss.start_good not in (None, 1.0):
             raise _refusal("loss.start_good", f"{loss.start_good:g}", "none; its chains start in the good state")
-        chances = (loss.to_bad, loss.to_good, loss.loss_bad, loss.loss_good)
-        return ["loss", "gemodel", *map(_percent, chances)]
+        return ["loss", "gemodel", *map(_percent, (loss.to_bad, loss.to_good, loss.loss_bad, loss.loss_good))]
     if isinstance(loss, FourStateLoss):
         if loss.start is not None:
             raise _refusal("loss.start", "probabilities", "none; its chains start in the good state")
