@@ -26,8 +26,6 @@ from testbed.channel.kernel.namespaces import (
 )
 from testbed.channel.kernel.plan import Hosts, Plan, Refused
 
-_NICE = -10
-
 
 def main(fd: int, owner: int) -> int:
     control = Control(socket.socket(fileno=fd))
@@ -47,8 +45,8 @@ def main(fd: int, owner: int) -> int:
         control.send({"refused": str(refused)})
         return 1
     sharp_timers()
-    with suppress(OSError):  # without root rights as the others
-        os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+    with suppress(OSError):  # without root rights, like any other process
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     gc.freeze()
     gc.disable()
     try:
