@@ -25,6 +25,7 @@ from testbed.channel.kernel.namespaces import (
     sharp_timers,
 )
 from testbed.channel.kernel.plan import Hosts, Plan, Refused
+from testbed.errors import TestbedError
 
 
 def main(fd: int, owner: int) -> int:
@@ -43,6 +44,9 @@ def main(fd: int, owner: int) -> int:
         control.send({"ready": True})
     except Refused as refused:
         control.send({"refused": str(refused)})
+        return 1
+    except TestbedError as error:
+        control.send({"wrong": str(error)})
         return 1
     sharp_timers()
     with suppress(OSError):  # without root rights, like any other process
@@ -86,12 +90,16 @@ def _answer(control: Control, hosts: Hosts) -> bool:
         asked, _ = control.receive()
     except EOFError:
         return False
-    if "change" in asked:
-        hosts.change(asked["change"], asked["impairments"])
     if "end" in asked:
         return False
     try:
-        control.send({"books": hosts.books()})
+        if "change" in asked:
+            hosts.change(asked["change"], asked["impairments"])
+        answer: dict[str, object] = {"books": hosts.books()}
+    except TestbedError as error:
+        answer = {"wrong": str(error)}
+    try:
+        control.send(answer)
     except OSError:
         return False
     return True
