@@ -313,6 +313,12 @@ EXACT: list[tuple[dict[str, Any], str]] = [
         "system.P0: P0 is not positive semi-definite: its smallest eigenvalue is -0.25",
     ),
     ({"system.R": [[0]]}, "system.R: R is not positive definite: its smallest eigenvalue is 0"),
+    ({"actuator.on_loss": "hol"}, "actuator.on_loss: got 'hol'; allowed: zero, hold; did you mean 'hold'?"),
+    ({"actuator.onloss": "hold"}, "actuator: unknown key 'onloss'; did you mean 'on_loss'?"),
+    (
+        {"system.B": ABSENT, "actuator": {"on_loss": "hold"}},
+        "actuator.on_loss: got 'hold', but system.B is not given; allowed: zero, or hold with system.B",
+    ),
     # the input
     (
         {"system.B": ABSENT, "input": {"kind": "constant", "value": [1]}},
@@ -454,7 +460,7 @@ def test_wrong_value(changes: dict[str, Any], expected: str) -> None:
 def test_an_unknown_key_like_no_other_lists_what_is_allowed() -> None:
     assert message(changed({"zzz": 1})) == (
         "unknown key 'zzz'; allowed: name, steps, lanes, seed, record, bounds, clock, system, uncertainty, "
-        "estimators, input, links, transport"
+        "estimators, actuator, input, links, transport"
     )
 
 

@@ -31,6 +31,8 @@ _TYPES: dict[LinkName, tuple[type[Packet], str, str]] = {
     "ack": (Acknowledgement, "plant", "nu"),
 }
 """Type, sender and content."""
+FIRST_STEP: dict[LinkName, int] = {link: model.FIRST_STEP for link, (model, _, _) in _TYPES.items()}
+"""The step of packet 0."""
 
 
 def role_of(link: LinkName) -> str:
@@ -94,11 +96,12 @@ def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]
     return dict(total)
 
 
-def _size(node: Node, model: type[Packet], content: str, setup: Setup) -> int:
+def packet_bytes(scenario: Scenario, link: LinkName) -> int:
     """Bytes of a packet of one lane as the testbed encodes it."""
-    widths = {"y": setup.sizes.p, "u": setup.sizes.q}
+    model, sender, content = _TYPES[link]
+    widths = {"y": scenario.system.p, "u": scenario.system.q}
     array = np.zeros((1, widths[content])) if content in widths else np.zeros(1, dtype=np.uint8)
-    return len(PacketEncoder(model, setup.run, node.name).encode(0, model.FIRST_STEP, 0, 1, {content: array}))
+    return len(PacketEncoder(model, "0" * 12, sender).encode(0, model.FIRST_STEP, 0, 1, {content: array}))
 
 
 class LinkService:
@@ -121,7 +124,7 @@ class LinkService:
         timed = is_timed(scenario, link)
         self._losses = {lane: loss_process(scenario, link, lane, lanes) for lane, lanes in setup.blocks if not timed}
         self._process_of = partial(_process, scenario, link)
-        size = _size(node, model, self._content, setup)
+        size = packet_bytes(scenario, link)
         self._timed = {lane: timed_block(scenario, link, lane, lanes, size) for lane, lanes in setup.blocks if timed}
         self._keeps_late = link != "control"
         self._counts = LossCounts()

@@ -9,11 +9,18 @@ from typing import Annotated
 
 import typer
 
-from testbed.cli import link_doctor, link_hosts
+from testbed.cli import link_doctor, link_hosts, link_relay
+from testbed.cli.link_import import import_
 from testbed.cli.link_names import link_name
+from testbed.cli.link_presets import presets
+from testbed.cli.link_report import report
 from testbed.errors import UsageError
 
 app = typer.Typer(help="Look at one link: of a scenario, or of a trace.", rich_markup_mode=None)
+
+app.command("import")(import_)
+app.command()(presets)
+app.command()(report)
 
 _LANE_MAX = 2**31 - 2  # the last lane of the largest scenario
 
@@ -59,7 +66,7 @@ def sample(
     expected = figures["expected_loss_rate"]
     typer.echo(
         f"{link}: {figures['sent']} sent, {figures['dropped']} lost, loss rate {figures['loss_rate']:.6g} "
-        f"(expected {expected:.6g}), mean burst {_shown(figures['mean_burst'])} "
+        f"(expected {'–' if expected is None else f'{expected:.6g}'}), mean burst {_shown(figures['mean_burst'])} "
         f"(expected {_shown(figures['expected_mean_burst'])}); {out}"
     )
 
@@ -116,6 +123,7 @@ def _shown(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
 
 
+app.command("relay")(link_relay.relay)
 app.command("hosts")(link_hosts.hosts)
 app.command("doctor")(link_doctor.doctor)
 app.command("clean")(link_doctor.clean)

@@ -31,7 +31,7 @@ class BoundsService:
 
     def __init__(self, node: Node, setup: Setup) -> None:
         model, bound = model_of(setup.scenario), control_bound(setup.scenario)
-        factor = model.control.covariance_factor
+        factor = None if model.holds else model.control.covariance_factor
         self._blocks = {lane: Bounds(model, bound, lanes) for lane, lanes in setup.blocks}
         self._correlated = {
             lane: upper_bound(model, factor * bound, lanes)

@@ -13,6 +13,8 @@ from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.channel.hidden import Hidden
 from testbed.channel.in_time import law_in_steps
+from testbed.estimator.bounds import held_factor
+from testbed.estimator.registry import model_of
 from testbed.estimator.service import acks_of, role_of
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import (
@@ -158,7 +160,7 @@ def between_bounds(
 
     The lower bound holds in every lane. The upper one holds in expectation, so that the mean may exceed it by three
     standard errors, and one lane says nothing. M's proof covers i.i.d. control losses; the bound taken is one that
-    holds for those of the run.
+    holds for those of the run. With an actuator that holds it is one for OE alone.
     """
     checks = []
     for name, figures in estimators.items():
@@ -167,7 +169,7 @@ def between_bounds(
         steps = [k for k, mean in enumerate(figures.trace_P_mean) if mean is not None]
         upper, symbol = valid_upper(bounds)
         slack = [3.0 * (e or 0.0) for e in figures.trace_P_stderr]
-        if scenario.lanes == 1:
+        if scenario.lanes == 1 or (figures.kind == "aoe" and model_of(scenario).holds):
             upper, symbol = (None,) * len(bounds.lower_mean), ""
         inside = sum(
             _at_most(bounds.lower_mean[k], figures.trace_P_mean[k])
@@ -227,6 +229,10 @@ def _bounds(conductor: Conductor) -> BoundFigures | None:
     lower = {"lower_mean": series.mean["lower"], "lower_stderr": series.stderr["lower"]}
     if control_bound(scenario) is None:
         no_bound = "the control is feedback, for which no bound is known"
+        return BoundFigures.model_validate({**lower, "upper_reason": no_bound})
+    model = model_of(scenario)
+    if model.holds and held_factor(model.control) is None:
+        no_bound = 'with on_loss = "hold" a bound is known for i.i.d. control losses only'
         return BoundFigures.model_validate({**lower, "upper_reason": no_bound})
     upper = {"upper_mean": series.mean["upper"], "upper_stderr": series.stderr["upper"]}
     if any(value is not None for value in series.mean["upper_correlated"]):

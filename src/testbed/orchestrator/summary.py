@@ -137,7 +137,7 @@ class Happened(_Model):
 
     step: NonNegativeInt
     by: Literal["timeline", "command"] = Field(description="whether the scenario or somebody outside asked for it")
-    link: str
+    link: str = Field(description="which link")
     set: dict[str, Any] = Field(description="keys of the link that changed")
 
 

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from testbed.errors import UsageError, did_you_mean
+from testbed.scenario.actuator import Actuator
 from testbed.scenario.base import Count, Part, count, problem, shown, size
 from testbed.scenario.changes import in_turn
 from testbed.scenario.durations import parse_duration
@@ -47,6 +48,7 @@ class Scenario(Part):
     estimators: Annotated[tuple[EstimatorSpec, ...], Field(strict=False)] = Field(
         default=(), description="The estimators, all on the same packets."
     )
+    actuator: Actuator = Field(default_factory=Actuator, description="What the plant applies where u is lost.")
     input: Input | None = Field(default_factory=_no_input, description="The input u; default zero. Only with system.B.")
     links: Links = Field(default_factory=Links, description="The links between the parts.")
     transport: Transport = Field(default_factory=Transport, description="How the processes of a run talk.")
@@ -106,6 +108,14 @@ class Scenario(Part):
     def variants(self, link: str) -> list[SteppedImpairments]:
         """The link of that name at the beginning, and after each of its events."""
         return in_turn(getattr(self.links, link), [change for _, change in self.changes_of(link)])
+
+    @field_validator("actuator")
+    @classmethod
+    def _check_actuator(cls, actuator: Actuator, info: ValidationInfo) -> Actuator:
+        system: System | None = info.data.get("system")
+        if actuator.on_loss == "hold" and system is not None and system.B is None:
+            raise problem("got 'hold', but system.B is not given; allowed: zero, or hold with system.B", "on_loss")
+        return actuator
 
     @field_validator("input")
     @classmethod

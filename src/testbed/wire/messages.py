@@ -155,7 +155,7 @@ class BoundsMessage(Packet):
     type: Literal["bounds"] = "bounds"
     ARRAYS: ClassVar[dict[str, ArrayRule]] = {
         "trace_lower": _floats("lanes", text="tr Pᴬ_k"),
-        "trace_upper": _floats("lanes", text="tr S_k; absent for an input without a bound", required=False),
+        "trace_upper": _floats("lanes", text="tr S_k; absent where no bound is known", required=False),
         "trace_upper_correlated": _floats(
             "lanes", text="tr S_k with room for correlated control losses; only under such", required=False
         ),
