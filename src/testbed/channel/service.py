@@ -93,6 +93,7 @@ def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]
         counts = block.counts.as_counters()
         total.update({key: counts[key] for key in ("bursts", "00", "01", "10", "11")})
         total.update(books.as_counters())
+        total.update({f"transport_{key}": count for key, count in block.transport.items()})
     return dict(total)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,11 @@ class TimedBlock:
         books.delivered -= self._stale
         books.dropped["stale"] += self._stale
         return books
+
+    @property
+    def transport(self) -> Counter[str]:
+        """What the connections under it did."""
+        return self._link.transport
 
     @property
     def late(self) -> int:

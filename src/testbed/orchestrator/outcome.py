@@ -77,7 +77,9 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
     sent, dropped, bursts = counters["sent"], counters["dropped"], counters["bursts"]
     losses = {"loss": dropped} if dropped else {}
     causes = {key.removeprefix("dropped_"): n for key, n in counters.items() if key.startswith("dropped_") and n}
+    transport = {key.removeprefix("transport_"): n for key, n in counters.items() if key.startswith("transport_")}
     return LinkFigures(
+        transport=transport,
         sent=sent,
         delivered=counters["delivered"],
         dropped=dropped,
