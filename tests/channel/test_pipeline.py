@@ -203,7 +203,8 @@ def test_a_change_to_the_same_changes_nothing(kind: str, clock: dict[str, str]) 
 
 
 @pytest.mark.parametrize(
-    "after", [{"recovery": 0.9, "failure": 0.05}, {"recovery": 0.1, "failure": 0.5}, {"recovery": 0.01, "failure": 0.01}]
+    "after",
+    [{"recovery": 0.9, "failure": 0.05}, {"recovery": 0.1, "failure": 0.5}, {"recovery": 0.01, "failure": 0.01}],
 )
 def test_a_chain_goes_on_from_its_state(after: dict[str, float]) -> None:
     other = {"kind": "markov", **after}
