@@ -78,6 +78,12 @@ def hidden(to_bad: float, to_good: float, loss_good: float = 0.0, loss_bad: floa
     }
 
 
+def four_state(to_good: float, to_pause: float, from_pause: float) -> dict[str, Any]:
+    """θ is the probability that a loss in a burst is followed by another."""
+    moves = {"to_good": to_good, "to_pause": to_pause, "from_pause": from_pause}
+    return {"kind": "four-state", "to_burst": 0.05, "to_isolated": 0.02, **moves}
+
+
 P3_C2 = {**P3, "C": [[1.0, 0.0], [0.0, 1.0]], "R": P3["Q"]}
 
 
@@ -91,6 +97,10 @@ P3_C2 = {**P3, "C": [[1.0, 0.0], [0.0, 1.0]], "R": P3["Q"]}
         (P3, hidden(0.9, 0.9, 0.1, 0.5), (True, "domination, M Theorem 5")),
         (P3, hidden(0.9, 0.9, 0.1, 0.9), (None, "none")),
         (P3, hidden(0.1, 0.2, 0.1, 0.9), (False, "bursts")),
+        (SCALAR, four_state(0.1, 0.05, 0.5), (False, "bursts")),
+        (SCALAR, four_state(0.5, 0.2, 0.5), (True, "bursts")),
+        (P3, four_state(0.5, 0.3, 0.3), (True, "domination, M Theorem 5")),
+        (P3, four_state(0.5, 0.3, 0.9), (None, "none")),
         (ROTATION, hidden(0.1, 0.3, 0.05, 0.2), (True, "domination, Sinopoli upper bound")),
         (ROTATION, hidden(0.1, 0.3, 0.05, 0.6), (None, "none")),
         ({**P3, "A": [[0.9, 0.0], [0.0, 0.2]], "C": [[0.0, 0.0]]}, hidden(0.1, 0.2, 0.1, 0.9), (True, "ρ(A) < 1")),
@@ -112,6 +122,20 @@ def test_a_hidden_state_that_is_the_fate_has_the_verdicts_of_the_chain(
     chain = figures(system, markov(recovery, failure), **links)
     same = figures(system, hidden(failure, recovery), **links)
     assert {**same, "observation": {**same["observation"], "kind": "markov"}} == chain
+
+
+@pytest.mark.parametrize("system", [M, P3])
+def test_what_is_replayed_has_the_verdicts_of_the_assumed_law(system: dict[str, Any]) -> None:
+    chain = markov(0.5, 0.125)
+    expected = figures(system, chain)
+    for loss in (
+        {"kind": "trace", "fates": "0011111111"},
+        {"kind": "scripted", "pattern": "1111001111"},
+        {"kind": "scripted", "lost": [3], "assumed": chain},
+    ):
+        found = figures(system, loss)
+        assert found["observation"].pop("kind") == loss["kind"]
+        assert found == {**expected, "observation": {k: v for k, v in expected["observation"].items() if k != "kind"}}
 
 
 @pytest.mark.parametrize(("to_good", "finite"), [(0.5, True), (0.05, False)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -240,6 +241,28 @@ def test_a_split_of_the_lanes_changes_no_fate() -> None:
     for lane, lanes in ((0, 1), (1, 3), (4, 2), (6, 1)):
         part = fates(MODELS["bursts with pauses"], 200, lane=lane, lanes=lanes)
         np.testing.assert_array_equal(part, whole[:, lane : lane + lanes])
+
+
+class Highest:
+    """In place of a stream: the largest number that one can draw."""
+
+    def __init__(self, lanes: int) -> None:
+        self._lanes = lanes
+
+    def uniforms(self, step: int) -> list[Any]:
+        point = 1.0 - 2.0**-53
+        return [point if self._lanes == 1 else np.full(self._lanes, point)]
+
+
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_rounding_leads_to_no_state_that_cannot_be(lanes: int) -> None:
+    """(1 − p13 − p14) + p13 may be less than 1 where p14 = 0."""
+    losses = four_state(0.23, 0.1, 0.2, 0.3)
+    assert any(sum(row[:-1]) < 1.0 for row in (losses.first, *losses.moves))
+    process = HiddenProcess(losses, Highest(lanes), Highest(lanes), lanes)  # type: ignore[arg-type]
+    for number in range(5):
+        state = int(np.atleast_1d(process.move(number))[0])
+        assert state != 3
 
 
 def test_the_first_packets_follow_the_start() -> None:

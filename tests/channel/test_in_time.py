@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from itertools import pairwise, product
 from math import prod
 from typing import Any
@@ -13,11 +14,15 @@ from scipy import stats
 
 from channel.impaired import MS, NAME, link
 from testbed.channel.carriers import carriers_of
-from testbed.channel.in_time import has_formula, law_in_steps
+from testbed.channel.in_time import has_formula, law_in_steps, law_of_link
 from testbed.channel.law import LossModel, law_of
+from testbed.channel.packets import packet_bytes
 from testbed.channel.steps import SteppedLink
+from testbed.scenario import parse_scenario
+from testbed.wire.codec import PacketEncoder
+from testbed.wire.messages import Acknowledgement, Control, Observation
 
-PERIOD = 10 * MS
+PERIOD, SIZE = 10 * MS, 100
 LENGTH = 4
 MARKOV = {"kind": "markov", "recovery": 0.5, "failure": 0.2, "start": 0.9}
 GE = {"kind": "gilbert-elliott", "to_bad": 0.2, "to_good": 0.4, "loss_good": 0.1, "loss_bad": 0.8, "start_good": 0.3}
@@ -100,7 +105,7 @@ def test_what_comes_too_late_is_lost(chain: str, thinned: str) -> None:
     (loss, states), (keys, in_time) = STATES[chain], THINNED[thinned]
     given = link(loss=loss, **keys)
     assert has_formula(given)
-    law = law_in_steps(given, PERIOD)
+    law = law_in_steps(given, PERIOD, SIZE)
     for fates in ALL:
         assert of_law(law, fates) == pytest.approx(summed(states, states[1], in_time, fates), rel=1e-9, abs=1e-13)
 
@@ -118,7 +123,7 @@ def test_slots_move_the_chain_as_often_as_they_begin(chain: str, slot: str, shar
     loss, states = STATES[chain]
     moves = sum(share * np.linalg.matrix_power(states[1], count) for count, share in shares.items())
     for keys, in_time in ({}, 1.0), ({"delay": UNIFORM}, 0.6):
-        law = law_in_steps(link(loss=loss, clock="time", slot=slot, **keys), PERIOD)
+        law = law_in_steps(link(loss=loss, clock="time", slot=slot, **keys), PERIOD, SIZE)
         for fates in ALL:
             expected = summed(states, np.asarray(moves), in_time, fates)
             assert of_law(law, fates) == pytest.approx(expected, rel=1e-9, abs=1e-13)
@@ -129,14 +134,14 @@ def test_the_law_assumed_is_the_law() -> None:
     _, states = STATES["markov"]
     for fates in ALL:
         expected = summed(states, states[1], 1.0, fates)
-        assert of_law(law_in_steps(given, PERIOD), fates) == pytest.approx(expected, rel=1e-12)
+        assert of_law(law_in_steps(given, PERIOD, SIZE), fates) == pytest.approx(expected, rel=1e-12)
 
 
 def frequencies(keys: dict[str, Any], lanes: int, packets: int) -> NDArray[np.float64]:
     """How often each row of three fates is seen, (lanes, 8): lanes are independent, and so are their frequencies."""
     given = link(**keys)
     carriers = carriers_of(given, 12, NAME, 0, lanes)
-    stepped = SteppedLink(carriers, 100, PERIOD, given.deadline_ns(PERIOD))
+    stepped = SteppedLink(carriers, SIZE, PERIOD, given.deadline_ns(PERIOD))
     fates = np.array([stepped.send(number).in_time for number in range(packets)], dtype=int)
     rows = 4 * fates[:-2] + 2 * fates[1:-1] + fates[2:]
     return np.array([np.bincount(lane, minlength=8) for lane in rows.T]) / len(rows)
@@ -154,7 +159,7 @@ def test_a_link_that_runs_has_the_law(name: str) -> None:
     """Hotelling's T² of the means of the lanes, which allows for what neighbours have in common."""
     lanes, packets = 200, 1000 if name == "delay" else 300
     found = frequencies(RUNNING[name], lanes, packets)
-    law = law_in_steps(link(**RUNNING[name]), PERIOD)
+    law = law_in_steps(link(**RUNNING[name]), PERIOD, SIZE)
     expected = np.array([of_law(law, fates) for fates in product((0, 1), repeat=3)])
     # Of eight frequencies that add up to 1, and of which runs of one end begin as often as they end, six are free.
     free = [0, 1, 2, 4, 5, 7]
@@ -175,9 +180,31 @@ def test_where_there_is_no_formula_the_pairs_are_those_of_the_link(keys: dict[st
     """Of the chain that is fitted, the law of two neighbours; both are counted, each with its own error."""
     given = link(**keys)
     assert not has_formula(given)
-    law = law_in_steps(given, PERIOD)
+    law = law_in_steps(given, PERIOD, SIZE)
     found = frequencies(keys, 40, 500).reshape(40, 4, 2).sum(axis=2)
     error = found.std(axis=0, ddof=1)
     # A sample of 20,000 packets is as 40 lanes of 500: the difference of two means.
     expected = np.array([of_law(law, pair, stationary=True) for pair in product((0, 1), repeat=2)])
     np.testing.assert_array_less(np.abs(found.mean(axis=0) - expected), 6 * error * np.sqrt(2 / 40) + 0.002)
+
+
+@pytest.mark.parametrize("width", [1, 2, 10])
+def test_the_law_is_that_of_packets_as_they_are_encoded(width: int) -> None:
+    """A line that carries just one of them a period, and none that are longer by a byte."""
+    eye = np.eye(width).tolist()
+    system = {"A": eye, "B": eye, "C": eye, "Q": eye, "R": eye}
+    contents: list[tuple[Any, str, str, NDArray[Any]]] = [
+        (Control, "controller", "u", np.zeros((1, width))),
+        (Observation, "plant", "y", np.zeros((1, width))),
+        (Acknowledgement, "plant", "nu", np.zeros(1, dtype=np.uint8)),
+    ]
+    for model, sender, content, array in contents:
+        name = model.__name__.lower()[:3] if model is Acknowledgement else model.__name__.lower()
+        encoder = PacketEncoder(model, secrets.token_hex(6), sender)
+        size = len(encoder.encode(0, model.FIRST_STEP, 0, 1, {content: array}))
+        for bits, arrival in ((8 * size, 1.0), (8 * size - 1, 0.0)):
+            rate = {"bits_per_second": bits * 100, "queue_packets": 1}
+            table = {"mode": "link", "rate": rate} if name == "ack" else {"rate": rate}
+            given = parse_scenario({"system": system, "links": {name: table}, "estimators": [{"name": "aoe"}]})
+            assert packet_bytes(given, name) == size
+            assert law_of_link(given, name).arrival == arrival

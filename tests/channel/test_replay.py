@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from testbed.channel.chains import chain_of
+from testbed.channel.in_time import law_of_link
 from testbed.channel.law import law_of
 from testbed.channel.loss import Chain
 from testbed.channel.pipeline import Pipeline
@@ -187,3 +188,15 @@ def test_losses_of_another_kind_begin_anew_and_those_of_as_many_states_go_on() -
         pipeline.change(link)
         seen.append([bool(pipeline.send(1, 0)) for _ in range(4)])
     assert seen == [[False] * 4, [False] * 4, [True] * 4, [True, False, True, False], [False] * 4]
+
+
+def test_through_a_bottleneck_the_law_is_that_of_the_assumed_losses() -> None:
+    """Sampled, and not from the trace, which would end."""
+    link = {"rate": {"bits_per_second": 1e6}, "clock": "packet"}
+    loss = {"kind": "trace", "fates": "0011111111" * 10, "repeat": False}
+    replayed, chain = (
+        parse_scenario({"system": SYSTEM, "steps": 100, "links": {"observation": {**link, "loss": given_}}})
+        for given_ in (loss, {"kind": "markov", "recovery": 0.5, "failure": 0.125})
+    )
+    laws = [law_of_link(at, "observation") for at in (replayed, chain)]
+    assert laws[0] == laws[1]

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from channel.impaired import NAME, impairments
-from testbed.channel.processes import process_of
 from testbed.channel.slots import Losses
 from testbed.numerics.streams import Stream
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,17 @@ from testbed.estimator.registry import create
 STEPS, LANES = 14, 3
 OPTIONS: dict[str, dict[str, Any]] = {"pf": {"particles": 30}}
 KINDS = ("aoe", "gpb2", "imm", "kfio", "lmmse", "pf", "rseio")
+HELD = ("aoe", "gpb2", "imm", "kfio", "lmmse", "ff", "pf")
 NEEDS_ACKS = ("kfio", "rseio")
 
 
 class Delays:
     """A trial, and when each observation and each ACK comes: step + delay, by lane; a loss never comes."""
 
-    def __init__(self, kind: str, seed: int, longest: int) -> None:
+    def __init__(self, kind: str, seed: int, longest: int, hold: bool = False) -> None:
         rng = np.random.default_rng(seed)
-        system = random_system(rng, 2, 1, 1, "bernoulli" if kind == "lmmse" else "markov")
+        system = random_system(rng, 2, 1, 1, "bernoulli" if kind in ("ff", "lmmse") else "markov")
+        system = replace(system, hold=hold)
         self.trial: Trial = random_trial(rng, system, STEPS, LANES, "all")
         self.model, self.kind, self.longest = model_of(system), kind, longest
         self.comes = np.arange(1, STEPS + 1)[:, None] + rng.integers(0, longest + 1, (STEPS, LANES))
@@ -69,10 +72,10 @@ class Delays:
         return out, refilter
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "hold"), [*((kind, False) for kind in KINDS), *((kind, True) for kind in HELD)])
 @pytest.mark.parametrize(("longest", "depth"), [(1, 4), (4, 4), (3, 8)])
-def test_late_is_as_good_as_in_time(kind: str, longest: int, depth: int) -> None:
-    delays = Delays(kind, seed=longest, longest=longest)
+def test_late_is_as_good_as_in_time(kind: str, hold: bool, longest: int, depth: int) -> None:
+    delays = Delays(kind, seed=longest, longest=longest, hold=hold)
     if kind == "aoe":
         delays.heard = np.minimum(delays.heard, np.arange(1, STEPS + 1)[:, None] + depth)
     found, refilter = delays.as_it_comes(depth)

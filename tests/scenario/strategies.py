@@ -172,6 +172,7 @@ def scenarios(draw: st.DrawFn) -> dict[str, Any]:
     if q and draw(st.booleans()):
         complete = [spec["name"] for spec in table["estimators"] if "until" not in spec]
         table["input"] = draw(inputs(n, q, steps, complete))
+    policies = ["zero", "hold"] if q else ["zero"]
     optional: dict[str, st.SearchStrategy[Any]] = {
         "name": texts,
         "lanes": st.integers(1, 10**6),
@@ -179,6 +180,7 @@ def scenarios(draw: st.DrawFn) -> dict[str, Any]:
         "record": st.sampled_from(["first", "all", "none"]),
         "bounds": st.booleans(),
         "clock": clocks,
+        "actuator": st.fixed_dictionaries({}, optional={"on_loss": st.sampled_from(policies)}),
         "links": st.fixed_dictionaries({}, optional={"control": links, "observation": observation_links, "ack": acks}),
         "transport": transports,
     }

@@ -62,8 +62,6 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ({"sytem": SYSTEM, "system": ABSENT}, "unknown key 'sytem'; did you mean 'system'?"),
     ({"seed": -1, "steps": 0, "lane": 1}, "unknown key 'lane'; did you mean 'lanes'? (and 2 more)"),
     ({"steps": 0, "seed": -1, "record": 1}, "steps: got 0; allowed: an integer, 1 … 2147483647 (and 2 more)"),
-    # later versions
-    ({"events": []}, "key 'events' is not supported by this version"),
     (
         {"links.ack.delay": "1 ms"},
         "links.ack.delay: got '1 ms'; allowed: a table with a kind: constant, uniform, normal, log-normal, table",
@@ -315,6 +313,12 @@ EXACT: list[tuple[dict[str, Any], str]] = [
         "system.P0: P0 is not positive semi-definite: its smallest eigenvalue is -0.25",
     ),
     ({"system.R": [[0]]}, "system.R: R is not positive definite: its smallest eigenvalue is 0"),
+    ({"actuator.on_loss": "hol"}, "actuator.on_loss: got 'hol'; allowed: zero, hold; did you mean 'hold'?"),
+    ({"actuator.onloss": "hold"}, "actuator: unknown key 'onloss'; did you mean 'on_loss'?"),
+    (
+        {"system.B": ABSENT, "actuator": {"on_loss": "hold"}},
+        "actuator.on_loss: got 'hold', but system.B is not given; allowed: zero, or hold with system.B",
+    ),
     # the input
     (
         {"system.B": ABSENT, "input": {"kind": "constant", "value": [1]}},
@@ -406,7 +410,7 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ({"estimators": [{"name": "oe", "a": 2**63}]}, f"estimators[0].a: got {2**63}; allowed: an integer of 64 bits"),
     (
         {"estimators": [{"name": "oe", "options": 3}]},
-        "estimators[0].options: got 3; allowed: a table, or its keys beside name, kind, acks, until",
+        "estimators[0].options: got 3; allowed: a table, or its keys beside name, kind, acks, until, buffer",
     ),
     (
         {"estimators": [{"name": "oe", "options": {"kind": 3}}]},
@@ -456,7 +460,7 @@ def test_wrong_value(changes: dict[str, Any], expected: str) -> None:
 def test_an_unknown_key_like_no_other_lists_what_is_allowed() -> None:
     assert message(changed({"zzz": 1})) == (
         "unknown key 'zzz'; allowed: name, steps, lanes, seed, record, bounds, clock, system, uncertainty, "
-        "estimators, input, links, transport"
+        "estimators, actuator, input, links, transport"
     )
 
 

@@ -66,11 +66,12 @@ def settled(A: Floats, C: Floats, Q: Floats, R: Floats) -> Settled | None:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """The losses of observations and of controls, and whether every ACK comes."""
+    """The losses of observations and of controls, whether every ACK comes, and whether the actuator holds."""
 
     observation: LossModel
     control: LossModel
     every_ack: bool
+    holds: bool = False
 
 
 def convergence(
@@ -83,8 +84,11 @@ def convergence(
     Σ_i 𝒜^{(i)} B (ν_i − Eν_i) u_i. The root of its variance is at most ½ Σ_i ‖𝒜^{(i)}‖ ‖B u_i‖ for any law of ν
     (Minkowski), which tends to 0 as D's M_k does. The error of OE is not larger in the mean, and ACKs make it smaller.
 
+    With an actuator that holds, B a_i is in the place of B ν_i u_i. It arrived j or more steps ago with a probability
+    that falls like θ^j, the decay of the link's bursts, so that E‖a_i‖² tends to 0 with u, and not faster than θ^i.
+
     rate: E[P̄_k] − P̄ goes to 0 as rate^k, up to a power of k: the larger of ρ(𝒜)², 𝒜 = A (I − K C), and of the square of
-    the factor by which u fades. It is a bound; the distance may fade faster.
+    the factor by which u fades, and of θ where inputs are held. It is a bound; the distance may fade faster.
     """
     control = links.control
     out: dict[str, Any] = dict.fromkeys(("limit", "limit_trace", "updated_trace", "rate"))
@@ -105,6 +109,11 @@ def convergence(
         return {**out, "reason": fading.reason}
     if out["theorem"] != "Kalman filter" and not control.independent:
         out["theorem"] = "D Theorem 3, for Markov losses"
+    if out["theorem"] != "Kalman filter" and links.holds and fading.factor > 0.0:
+        out["theorem"] = "D Theorem 3, for held inputs"
+        if control.burst_decay >= 1.0:
+            return {**out, "reason": "the actuator holds, and control losses may never end"}
+        fading = _held(fading, control.burst_decay)
     rate = max(found.radius, fading.factor) ** 2
     return {
         **out,
@@ -137,6 +146,12 @@ def fading_of(source: Input | None) -> Fading:
         return _zero_or_not(silent, "u is drawn afresh at each step: it does not tend to 0")
     kind = "fed back" if isinstance(source, FeedbackInput) else "a table of finite length"
     return Fading(None, 1.0, f"u is {kind}: its limit is not known")
+
+
+def _held(fading: Fading, decay: float) -> Fading:
+    """Of what is applied, where an input that fades is held through bursts of losses with that decay."""
+    factor = max(fading.factor, math.sqrt(decay))
+    return Fading(True, factor, f"{fading.reason}, and what is held by {factor:.6g}")
 
 
 def _zero_or_not(zero: bool, otherwise: str) -> Fading:

@@ -16,10 +16,11 @@ from testbed.analysis.peak import burst_series, condition_two, failure_limit, gr
 from testbed.analysis.robust_verdicts import robust_figures
 from testbed.analysis.strong import StrongObservability, strong_observability
 from testbed.analysis.structure import Reach, controllability, observability, unstable_eigenvalues
-from testbed.channel.chains import chain_of
 from testbed.channel.hidden import Hidden
+from testbed.channel.in_time import law_of_link
 from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain
+from testbed.estimator.bounds import held_factor
 from testbed.numerics.lanes import Floats
 from testbed.scenario import FeedbackInput, Input, Links, Loss, Scenario
 
@@ -108,7 +109,9 @@ def analyze(scenario: Scenario) -> dict[str, Any]:
 def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
     A = facts.A
     observed, controlled = scenario.links.observation.loss, scenario.links.control.loss
-    chain, control = _simplest(chain_of(observed)), _simplest(chain_of(controlled))
+    chain = _simplest(law_of_link(scenario, "observation"))
+    in_time = law_of_link(scenario, "control")
+    control = _simplest(in_time)
     verdict = observation_verdict(facts, chain)
     return {
         "name": scenario.name,
@@ -134,11 +137,11 @@ def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
         "observation": {**_link(observed, chain), **verdict.table()},
         "control": {
             **_link(controlled, control),
-            **control_verdict(verdict, control, scenario.input, scenario.links).table(),
+            **_control(scenario, verdict, control).table(),
         },
         "bounds": {
             "lower": Verdict(verdict.stable, verdict.theorem, f"covariance with every ACK: {verdict.reason}").table(),
-            "upper": upper_bound_verdict(verdict, scenario.input).table(),
+            "upper": _upper_bound(scenario, verdict, control).table(),
         },
         "peak": peak_figures(facts, chain),
         "moments": moment_figures(facts, chain, verdict),
@@ -146,11 +149,28 @@ def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
             facts.observable,
             facts.controllable,
             settled(A, facts.C, facts.Q, np.array(scenario.system.R)),
-            Knowledge(chain, chain_of(controlled), scenario.links.ack.mode == "perfect"),
+            Knowledge(
+                chain,
+                in_time,
+                scenario.links.ack.mode == "perfect",
+                scenario.actuator.on_loss == "hold",
+            ),
             scenario.input,
         ),
         "robust": robust_figures(scenario),
     }
+
+
+def _control(scenario: Scenario, observation: Verdict, control: LossModel) -> Verdict:
+    if scenario.actuator.on_loss == "hold":
+        return held_control_verdict(observation, control, scenario.input, scenario.links)
+    return control_verdict(observation, control, scenario.input, scenario.links)
+
+
+def _upper_bound(scenario: Scenario, observation: Verdict, control: LossModel) -> Verdict:
+    if scenario.actuator.on_loss == "hold" and not control.never_loses:
+        return held_bound_verdict(observation, control, scenario.input)
+    return upper_bound_verdict(observation, scenario.input)
 
 
 def _simplest(losses: LossModel) -> LossModel:
@@ -242,6 +262,27 @@ def control_verdict(observation: Verdict, chain: LossModel, source: Input | None
     return Verdict(
         observation.stable, theorem, "u is bounded: control losses change the covariance, not whether it is bounded"
     )
+
+
+def held_control_verdict(observation: Verdict, chain: LossModel, source: Input | None, links: Links) -> Verdict:
+    """The same with an actuator that holds: by S of held inputs, which the papers do not have."""
+    if source is None or chain.never_loses or links.ack.mode == "perfect":
+        return control_verdict(observation, chain, source, links)
+    bound = held_bound_verdict(observation, chain, source)
+    if bound.stable is None or bound.stable is not observation.stable:
+        return Verdict(False if observation.stable is False else None, bound.theorem, bound.reason)
+    reason = "u is bounded, and so is what is held: control losses change the covariance, not whether it is bounded"
+    return Verdict(observation.stable, bound.theorem, reason)
+
+
+def held_bound_verdict(observation: Verdict, chain: LossModel, source: Input | None) -> Verdict:
+    """S with an actuator that holds (see estimator.bounds): for i.i.d. control losses."""
+    theorem, factor = "S, held inputs", held_factor(chain)
+    if isinstance(source, FeedbackInput):
+        return Verdict(None, theorem, "u is fed back: no bound of what is held is known")
+    if factor is None:
+        return Verdict(None, theorem, "the actuator holds, and a bound is known for i.i.d. control losses only")
+    return Verdict(observation.stable, theorem, f"the recursion with every ACK, and {factor:.6g} · ¼ U more noise")
 
 
 def upper_bound_verdict(observation: Verdict, source: Input | None) -> Verdict:

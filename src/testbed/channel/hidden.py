@@ -199,9 +199,8 @@ class HiddenProcess:
 
     def __init__(self, losses: HiddenChain, states: Stream, drops: Stream, lanes: int) -> None:
         self._states, self._drops, self._lanes = states, drops, lanes
-        self._first = np.cumsum(losses.initial)[:-1]
-        self._next = np.cumsum(losses.transition, axis=1)[:, :-1]
-        self._ends = [ends.tolist() for ends in self._next]
+        self._first, ends = _ends(losses.initial).tolist(), _ends(losses.transition)
+        self._rows, self._columns = ends.tolist(), list(np.ascontiguousarray(ends.T))
         self._arrival = 1.0 - losses.loss
         self._drawn = bool(((losses.loss > 0.0) & (losses.loss < 1.0)).any())
         self.states = len(losses.losses)
@@ -215,15 +214,24 @@ class HiddenProcess:
         """State ``number``, from the one before."""
         (point,) = self._states.uniforms(number)
         if self._lanes == 1:
-            ends = self._first if self.state is None else self._ends[self.state]
+            ends = self._first if self.state is None else self._rows[self.state]
             self.state = sum(point >= end for end in ends)
-        else:
-            ends = self._first if self.state is None else self._next[self.state]
-            self.state = (np.asarray(point)[:, None] >= ends).sum(axis=1)
-        return self.state
+            return self.state
+        before, state = self.state, np.zeros(self._lanes, dtype=np.intp)
+        for column, end in zip(self._columns, self._first, strict=True):
+            state += point >= (end if before is None else column[before])
+        self.state = state
+        return state
 
     def fate(self, number: int, state: State) -> Mask:
         """The fate of packet ``number`` in that state."""
         arrival = self._arrival[state]
         (point,) = self._drops.uniforms(number) if self._drawn else (0.5,)
         return bool(point < arrival) if self._lanes == 1 else np.asarray(point < arrival)
+
+
+def _ends(chances: Floats) -> Floats:
+    """Where the places of the states but the last end on 0 … 1, (…, H − 1); beyond it if no later one can be, so that
+    rounding does not lead there."""
+    later = np.cumsum(chances[..., ::-1], axis=-1)[..., ::-1][..., 1:]
+    return np.where(later > 0.0, np.cumsum(chances, axis=-1)[..., :-1], np.inf)

@@ -57,3 +57,11 @@ def process_of(loss: Loss, stream_of: Callable[[str], Stream], lanes: int) -> Fa
         assert isinstance(losses, HiddenChain)
         return HiddenProcess(losses, stream_of("state"), stream_of("loss"), lanes)
     return LossProcess(losses, stream_of("loss"), lanes)
+
+
+def goes_on(process: FateProcess, before: FateProcess) -> bool:
+    """Let a process go on from the state of another with as many states; whether it does."""
+    if process.states != before.states:
+        return False
+    process.state = before.state
+    return True

@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 
 from testbed.channel.carriers import carriers_of
 from testbed.channel.loss import LossCounts
-from testbed.channel.processes import FateProcess, process_of
+from testbed.channel.packets import packet_bytes
+from testbed.channel.processes import FateProcess, goes_on, process_of
 from testbed.channel.steps import SteppedLink
 from testbed.channel.timed import TimedBlock
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
 from testbed.scenario import AckLink, Link, Loss, NoLoss, Scenario
+from testbed.scenario.changes import changed
 from testbed.scenario.links import SteppedImpairments
-from testbed.wire.codec import PacketEncoder
 from testbed.wire.keys import LinkName
-from testbed.wire.messages import Acknowledgement, Control, Observation, Packet
-from testbed.wire.node import Node
+from testbed.wire.messages import Acknowledgement, Change, Control, Observation, Packet
+from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.setup import Setup
 
 _TYPES: dict[LinkName, tuple[type[Packet], str, str]] = {
@@ -30,6 +31,8 @@ _TYPES: dict[LinkName, tuple[type[Packet], str, str]] = {
     "ack": (Acknowledgement, "plant", "nu"),
 }
 """Type, sender and content."""
+FIRST_STEP: dict[LinkName, int] = {link: model.FIRST_STEP for link, (model, _, _) in _TYPES.items()}
+"""The step of packet 0."""
 
 
 def role_of(link: LinkName) -> str:
@@ -50,11 +53,21 @@ def loss_of(scenario: Scenario, link: LinkName) -> Loss:
 
 def loss_process(scenario: Scenario, link: LinkName, lane: int, lanes: int) -> FateProcess:
     """The loss process of a block of lanes of a link; the same draws wherever it runs."""
+    return _process(scenario, link, loss_of(scenario, link), lane, lanes)
 
+
+def _process(scenario: Scenario, link: LinkName, loss: Loss, lane: int, lanes: int) -> FateProcess:
     def stream(purpose: str) -> Stream:
         return Stream(scenario.seed, role_of(link), purpose, width=1, lane=lane, lanes=lanes)
 
-    return process_of(loss_of(scenario, link), stream, lanes)
+    return process_of(loss, stream, lanes)
+
+
+def is_timed(scenario: Scenario, link: LinkName) -> bool:
+    """Whether a link takes time, at the beginning or after an event, or carries ACKs in batches."""
+    settings = getattr(scenario.links, link)
+    batched = isinstance(settings, AckLink) and settings.batch > 1
+    return batched or any(variant.takes_time for variant in scenario.variants(link))
 
 
 def timed_block(scenario: Scenario, link: LinkName, lane: int, lanes: int, size: int) -> TimedBlock:
@@ -83,13 +96,6 @@ def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]
     return dict(total)
 
 
-def _size(node: Node, model: type[Packet], content: str, setup: Setup) -> int:
-    """Bytes of a packet of one lane as the testbed encodes it."""
-    widths = {"y": setup.sizes.p, "u": setup.sizes.q}
-    array = np.zeros((1, widths[content])) if content in widths else np.zeros(1, dtype=np.uint8)
-    return len(PacketEncoder(model, setup.run, node.name).encode(0, model.FIRST_STEP, 0, 1, {content: array}))
-
-
 class LinkService:
     """Emulates one link, lane by lane.
 
@@ -101,37 +107,62 @@ class LinkService:
 
     def __init__(self, node: Node, setup: Setup, *, link: LinkName) -> None:
         model, sender, self._content = _TYPES[link]
-        settings: SteppedImpairments = getattr(setup.scenario.links, link)
-        batch = settings.batch if isinstance(settings, AckLink) else 1
-        timed = settings.takes_time or batch > 1
-        self._losses = {
-            lane: loss_process(setup.scenario, link, lane, lanes) for lane, lanes in setup.blocks if not timed
-        }
-        size = _size(node, model, self._content, setup)
-        self._timed = {
-            lane: timed_block(setup.scenario, link, lane, lanes, size) for lane, lanes in setup.blocks if timed
-        }
+        scenario = setup.scenario
+        self._first_step = model.FIRST_STEP
+        self._changes = scenario.changes_of(link)
+        settings: SteppedImpairments = getattr(scenario.links, link)
+        self._now = {lane: (0, settings) for lane, _ in setup.blocks}
+        """By block of lanes: how many changes were made, and the link after them."""
+        timed = is_timed(scenario, link)
+        self._losses = {lane: loss_process(scenario, link, lane, lanes) for lane, lanes in setup.blocks if not timed}
+        self._process_of = partial(_process, scenario, link)
+        size = packet_bytes(scenario, link)
+        self._timed = {lane: timed_block(scenario, link, lane, lanes, size) for lane, lanes in setup.blocks if timed}
         self._keeps_late = link != "control"
         self._counts = LossCounts()
         self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
-        noise = link == "observation" and setup.scenario.links.observation.on_loss == "noise"
+        noise = link == "observation" and scenario.links.observation.on_loss == "noise"
         self._instead = "noise" if noise else None
         needs = (self._content, self._instead) if self._instead else (self._content,)
         handler = self._pass_on_timed if timed else self._pass_on
         node.on(node.keys.sent(link), model, sender, handler, needs=needs)
+        node.on(node.keys.change(link), Change, ORCHESTRATOR, self._note)
 
     @property
     def counters(self) -> dict[str, int]:
         return timed_counters(list(self._timed.values()), self._keeps_late) or self._counts.as_counters()
 
+    def _note(self, change: Change, _: dict[str, NDArray[Any]]) -> None:
+        """Take an order to change from a step on that is still to come; the orchestrator has checked it."""
+        self._changes.append((change.step, change.set))
+        self._changes.sort(key=lambda entry: entry[0])
+
+    def _change(self, lane: int, lanes: int, step: int) -> None:
+        """What is to hold from this step on, holds."""
+        made, settings = self._now[lane]
+        while made < len(self._changes) and self._changes[made][0] <= step:
+            settings = changed(settings, self._changes[made][1])
+            made += 1
+            self._now[lane] = made, settings
+            if self._timed:
+                self._timed[lane].change(settings)
+            else:
+                before = self._losses[lane]
+                self._losses[lane] = self._process_of(settings.loss, lane, lanes)
+                goes_on(self._losses[lane], before)
+
     def _pass_on(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         lane = packet.lane
-        arrived = self._losses[lane].next(packet.step - packet.FIRST_STEP)
+        if self._changes:
+            self._change(lane, packet.lanes, packet.step)
+        arrived = self._losses[lane].next(packet.step - self._first_step)
         self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
         self._counts.count(lane, arrived)
 
     def _pass_on_timed(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
-        lane, number = packet.lane, packet.step - packet.FIRST_STEP
+        lane, number = packet.lane, packet.step - self._first_step
+        if self._changes:
+            self._change(lane, packet.lanes, packet.step)
         if self._keeps_late:
             delivered = self._timed[lane].pass_on(number, arrays[self._content])
         else:

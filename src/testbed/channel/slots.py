@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from testbed.channel.processes import FateProcess, process_of
+from testbed.channel.processes import FateProcess, goes_on, process_of
 from testbed.numerics.streams import Stream
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.links import Impairments
@@ -34,8 +34,8 @@ class Losses:
         """
         before = self._process
         self._set(settings)
-        if self._process.states == before.states and before.state is not None:
-            self._process.state = self._state = before.state
+        if goes_on(self._process, before) and before.state is not None:
+            self._state = before.state
         elif self._last_ns is not None:
             self._slot -= 1  # a first state of the new kind, in this slot
 

@@ -58,7 +58,7 @@ def sample(
     expected = figures["expected_loss_rate"]
     typer.echo(
         f"{link}: {figures['sent']} sent, {figures['dropped']} lost, loss rate {figures['loss_rate']:.6g} "
-        f"(expected {expected:.6g}), mean burst {_shown(figures['mean_burst'])} "
+        f"(expected {'–' if expected is None else f'{expected:.6g}'}), mean burst {_shown(figures['mean_burst'])} "
         f"(expected {_shown(figures['expected_mean_burst'])}); {out}"
     )
 
@@ -88,6 +88,27 @@ def fit(
     from testbed.cli.fit_tables import show
 
     show(str(trace), fitted, fates.duplicates)
+
+
+@app.command(name="set")
+def set_(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run that goes.")],
+    name: Annotated[str, typer.Argument(metavar="LINK", help="control, observation or ack.")],
+    settings: Annotated[
+        list[str], typer.Argument(metavar="KEY=VALUE…", help="Keys of the link's table, such as loss.failure=0.4.")
+    ],
+) -> None:
+    """Change a link of a run that goes: other values for keys of its table, from the next step on.
+
+    The random streams go on, and nothing in flight is lost. A value "none" removes a stage. The step from which the
+    change holds is printed, and is in the results of the run.
+    """
+    from testbed.orchestrator.running import ask
+    from testbed.scenario.changes import parse_setting, together
+
+    change = together([parse_setting(text) for text in settings])
+    answer = ask(run, {"link": _link(name), "set": change})
+    typer.echo(f"{name}: from step {answer['step']} on")
 
 
 def _link(name: str) -> LinkName:

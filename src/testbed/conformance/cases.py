@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from testbed.channel.gilbert_elliott import GilbertElliott
 from testbed.channel.law import Law, LossModel, law_of
 from testbed.channel.loss import Chain
+from testbed.estimator.hold import applied_inputs
 from testbed.estimator.model import Ack, Model
 from testbed.numerics.lanes import Floats
 
@@ -102,12 +103,20 @@ def simulated(name: str, model: Model, *, steps: int, lanes: int, seed: int, arr
     w = _normal(rng, model.Q, (steps, lanes))
     v = _normal(rng, model.R, (steps, lanes))
     x, states = model.x0_mean + _normal(rng, model.P0, (lanes,)), np.empty((steps, lanes, model.n))
+    applied = nu[..., None] * u
+    if model.holds:
+        applied = applied_inputs(u.swapaxes(1, 2), nu).swapaxes(1, 2)
     for k in range(steps):
-        push = 0.0 if model.B is None else nu[k][:, None] * (u[k] @ model.B.T)
+        push = 0.0 if model.B is None else applied[k] @ model.B.T
         x = states[k] = x @ model.A.T + push + w[k]
     y = states @ model.C.T + v
     y[~arrived] = 0.0
     return Case(name, model, u, y, arrived, nu, states)
+
+
+def holding(model: Model) -> Model:
+    """The same with an actuator that holds the input applied last."""
+    return replace(model, on_loss="hold")
 
 
 def without_control(model: Model) -> Model:

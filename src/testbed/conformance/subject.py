@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 
 from testbed.channel.loss import Chain
-from testbed.conformance.cases import BERNOULLI, HIDDEN, MARKOV, Case, one, simulated, three, two
+from testbed.conformance.cases import BERNOULLI, HIDDEN, MARKOV, Case, holding, one, simulated, three, two
 from testbed.conformance.result import Failed, Skipped
 from testbed.errors import UsageError
 from testbed.estimator.errors import MissingAck
 from testbed.estimator.model import Estimator, Model
+from testbed.estimator.registry import check_actuator
 from testbed.numerics.lanes import Floats
 
 STEPS = 9
 GILBERT_ELLIOTT = "n = 2, Gilbert–Elliott"
+HOLD = "n = 2, hold"
 IN_TIME = (0,)
 """Delays of ACKs: each comes with the step in which its packet counts."""
 
@@ -64,6 +66,7 @@ class Subject:
 
     def make(self, case: Case, lane: int = 0) -> Estimator:
         made: Estimator = self.factory(case.model, case.lanes, **self.options)
+        check_actuator(made, case.model)
         begin_at = getattr(made, "begin_at", None)
         if begin_at is not None:
             begin_at(lane)
@@ -114,7 +117,7 @@ class Subject:
     @cached_property
     def small(self) -> dict[str, Model]:
         """The systems with one and two states, of those that it takes. Raises Skipped where it takes none of them."""
-        models = {"n = 1": one(self.control), "n = 2": two(self.control)}
+        models = {"n = 1": one(self.control), "n = 2": two(self.control), HOLD: holding(two(self.control))}
         taken = {name: model for name, model in models.items() if name not in self.refused}
         if not taken:
             raise Skipped("it refuses systems with one and two states")
@@ -126,6 +129,7 @@ class Subject:
             simulated("n = 1", one(self.control), steps=STEPS, lanes=1, seed=1),
             simulated("n = 2", two(self.control), steps=STEPS, lanes=3, seed=2),
             simulated("n = 3", three(self.control), steps=STEPS, lanes=3, seed=3),
+            simulated(HOLD, holding(two(self.control)), steps=STEPS, lanes=3, seed=6),
         ]
         if self.control is MARKOV:
             out.append(simulated(GILBERT_ELLIOTT, two(HIDDEN), steps=STEPS, lanes=3, seed=4))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from testbed.conformance.cases import Case, simulated
@@ -113,11 +115,14 @@ def long_losses(subject: Subject) -> str:
     worst = min(_through(subject, LOST, name, model, IN_TIME) for name, model in systems.items())
     texts = [f"{LOST} lost in a row with every ACK"]
     if not subject.delays:
-        try:
-            worst = min(worst, *(_through(subject, LOST_BLIND, name, model, ()) for name, model in systems.items()))
-            texts.append(f"{LOST_BLIND} with none")
-        except TooManyHistories:
-            texts.append(f"{LOST_BLIND} with none are more than it can enumerate")
+        found: dict[str, float] = {}
+        for name, model in systems.items():
+            with suppress(TooManyHistories):
+                found[name] = _through(subject, LOST_BLIND, name, model, ())
+        worst = min([worst, *found.values()])
+        beyond = [name for name in systems if name not in found]
+        where = "" if not beyond or not found else f" ({', '.join(beyond)})"
+        texts.append(f"{LOST_BLIND} with none" + (f" are more than it can enumerate{where}" if beyond else ""))
     return f"{', '.join(texts)}: P at least {worst:.3g} times the covariance with every ACK"
 
 

@@ -9,8 +9,11 @@ from __future__ import annotations
 from functools import lru_cache, partial
 from typing import Any, ClassVar
 
+import numpy as np
 from numpy.typing import NDArray
 
+from testbed.estimator.hold import kept, of_state, prior_of, refuse_moments, renewed, size_of, with_input
+from testbed.estimator.mixtures import merged
 from testbed.estimator.model import Ack, Estimate, Model, newest_ack
 from testbed.estimator.riccati import Gain, log_odds, phi, predict
 from testbed.estimator.state import Given, State, last_law, start_of, state_of
@@ -27,6 +30,7 @@ from testbed.numerics.lanes import (
     constant_times,
     exp,
     full,
+    full_vector,
     mask_of,
     scale,
     subtract,
@@ -42,14 +46,18 @@ _Weights = tuple[Component, Component]
 
 
 class Aoe:
-    """One Gaussian and the posterior of the last state of the losses; two hypotheses a step, merged by moments."""
+    """One Gaussian and the posterior of the last state of the losses; two hypotheses a step, merged by moments.
+
+    With an actuator that holds, it is a Gaussian of (x, a), a the input applied last (see ``hold``).
+    """
 
     STATE_VERSION: ClassVar[int] = 1
+    takes_hold: ClassVar[bool] = True
 
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
-        self._advance = _stepper(model, lanes)
-        self._x, self._p = model.prior(lanes)
+        self._advance = (_held_stepper if model.holds else _stepper)(model, lanes)
+        self._x, self._p = prior_of(model, lanes)
         self._moves: list[list[float]] = model.law.transition.T.tolist()
         self._visible = model.law.visible
         self._among = model.law.states_of(False), model.law.states_of(True)
@@ -66,6 +74,8 @@ class Aoe:
         known = self._decided(weights, acks)
         self._x, self._p, *posterior = self._advance(gamma, self._x, self._p, *known, vector_of(u), vector_of(y))
         self._states = self._shared(states, weights, (posterior[0], posterior[1]))
+        if self._model.holds:
+            return Estimate(*of_state(self._model, self._x, self._p), self._lanes)
         return Estimate(self._x, self._p, self._lanes)
 
     def state(self) -> State:
@@ -75,13 +85,16 @@ class Aoe:
 
     def set_state(self, state: State) -> None:
         given = Given(state, self._lanes, self._model.n)
-        x, p = given.vector("x"), given.matrix("P")
+        x, p = given.vector("x", size_of(self._model)), given.matrix("P", size_of(self._model))
         states = [given.component(f"state{h}") for h in range(len(self._model.law.arrived))] if given.step else None
         given.end()
         self._k, self._x, self._p, self._states = given.step, x, p, states
 
     def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
+        refuse_moments(self._model, step)
         self._x, self._p = start_of(step, x_hat, P, self._lanes, self._model.n)
+        if self._model.holds:
+            self._x, self._p = with_input(self._x, self._p, full_vector(np.zeros(self._model.q), self._lanes))
         self._k, self._states = step, None
         if step:
             self._states = [full(float(weight), self._lanes) for weight in last_law(self._model.law, step)]
@@ -140,6 +153,25 @@ def _advance(
         )
     merged = add_outer(phi(covariance, gain, gamma), lost * delivered, shift)
     return add(idle, scale(delivered, shift)), merged, lost, delivered
+
+
+def _advance_held(
+    model: Model, gamma: Mask, z: Vector, P: Matrix, lost: Component, delivered: Component, u: Vector, y: Vector
+) -> tuple[Vector, Matrix, Component, Component]:
+    """The same for (x, a) of an actuator that holds."""
+    (idle, first, score), (moved, second, other) = kept(model, gamma, z, P, y), renewed(model, gamma, z, P, u, y)
+    if any_of(gamma):
+        updated = _bayes((lost, delivered), other - score)
+        lost, delivered = where(gamma, updated[0], lost), where(gamma, updated[1], delivered)
+    mean, covariance = merged((lost, delivered), (idle, first), (moved, second))
+    return mean, covariance, lost, delivered
+
+
+@lru_cache(maxsize=16)
+def _held_stepper(model: Model, lanes: int) -> Step:
+    size = size_of(model)
+    state: tuple[Shape, ...] = (("vector", size), ("symmetric", size), ("scalar", 1), ("scalar", 1))
+    return masked_step(partial(_advance_held, model), (*state, ("vector", model.q), ("vector", model.p)), state, lanes)
 
 
 @lru_cache(maxsize=16)

@@ -8,6 +8,14 @@ is enough for the best estimator; that is the *correlated* upper bound here. For
 δ² r^|i−j| Var(s_i), i < j, with s_i = 1 in the good state, r the memory of the states, and δ the difference of their
 arrival probabilities: ¼U (1 + 2 δ² |r|/(1 − |r|)) is enough. In general the factor of ¼U is the ``covariance_factor``
 of the losses.
+
+
+With an actuator that holds, what is not known is the applied input a_k, and ¼U is a bound of Var(B a_k). Under i.i.d.
+losses with arrival rate λ, E[a_j | a_i] − E[a_j] = (1 − λ)^(j−i) (a_i − E[a_i]) for i < j, so that Cov(a_i, a_j) =
+(1 − λ)^|i−j| Var(a_min(i,j)). As |v'Dw| ≤ ½ v'Dv + ½ w'Dw for each D = Var(a_i), white noise of the covariance
+¼U Σ_m (1 − λ)^|m| = ¼U (2 − λ)/λ a step is not below the joint covariance of the B a_k. It is enough for a linear
+filter, and so in the mean for the best estimator. For other losses, where how long an input is held depends on when it
+came, no bound is given.
 """
 
 from __future__ import annotations
@@ -19,11 +27,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.channel.law import LossModel
 from testbed.estimator.model import Model
 from testbed.estimator.riccati import Gain, phi, predict
 from testbed.numerics.lanes import Constant, Floats, Mask, Matrix, constant, mask_of, matrices_of
 from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
+
+
+def held_factor(control: LossModel) -> float | None:
+    """(2 − λ)/λ, by which the holding of inputs adds up; None where no bound is known."""
+    if not control.independent or control.first_arrival == 0.0:
+        return None
+    return (2.0 - control.first_arrival) / control.first_arrival
 
 
 class CovarianceBound:
@@ -40,7 +56,7 @@ class CovarianceBound:
 
 
 def upper_bound(model: Model, U: Floats, lanes: int) -> CovarianceBound:
-    """S for an input with B u_k u_k' B' ≤ U for all k."""
+    """S for an input with Var(ν_k B u_k) ≤ ¼U for all k, so with B u_k u_k' B' ≤ U."""
     return CovarianceBound(model, model.Q + 0.25 * U, lanes)
 
 
@@ -80,12 +96,16 @@ class LateBound:
 
 
 class Bounds:
-    """Lower: the ACK covariance Pᴬ. Upper: S, for an input with B u_k u_k' B' ≤ U for all k; none without U."""
+    """Lower: the ACK covariance Pᴬ. Upper: S, for an input with B u_k u_k' B' ≤ U for all k; none without U.
+
+    With an actuator that holds: Var(B a_k) ≤ ¼U for all k; none where losses are not i.i.d.
+    """
 
     def __init__(self, model: Model, U: Floats | None, lanes: int) -> None:
         self._lanes = lanes
         self._lower = CovarianceBound(model, model.Q, lanes)
-        self._upper = None if U is None else upper_bound(model, U, lanes)
+        factor = held_factor(model.control) if model.holds else 1.0
+        self._upper = None if U is None or factor is None else upper_bound(model, factor * U, lanes)
 
     def step(self, arrived: NDArray[Any]) -> tuple[Floats, Floats | None]:
         """Pᴬ_k and S_k, each (M, n, n), after the observations ``arrived`` (M,) of step k."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.channel.service import is_timed
 from testbed.errors import RunFailed
 from testbed.estimator.bounds import Bounds, LateBound, upper_bound
 from testbed.estimator.registry import model_of
@@ -30,7 +31,7 @@ class BoundsService:
 
     def __init__(self, node: Node, setup: Setup) -> None:
         model, bound = model_of(setup.scenario), control_bound(setup.scenario)
-        factor = model.control.covariance_factor
+        factor = None if model.holds else model.control.covariance_factor
         self._blocks = {lane: Bounds(model, bound, lanes) for lane, lanes in setup.blocks}
         self._correlated = {
             lane: upper_bound(model, factor * bound, lanes)
@@ -40,7 +41,7 @@ class BoundsService:
         self._late = {
             lane: LateBound(model, lanes, _DEPTH)
             for lane, lanes in setup.blocks
-            if setup.scenario.links.observation.takes_time
+            if is_timed(setup.scenario, "observation")
         }
         self._send = node.sender(node.keys.bounds, BoundsMessage, lazy=True)
         node.on(node.keys.delivered("observation"), Observation, "link.observation", self._take, needs=("mask",))

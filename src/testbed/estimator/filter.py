@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from testbed.errors import UsageError
 from testbed.estimator.model import Ack, Estimate, Estimator, Model
-from testbed.estimator.registry import create
+from testbed.estimator.registry import check_actuator, create
 from testbed.estimator.snapshot import Form, Snapshot, restore, take
 from testbed.numerics.lanes import Floats, matrix_of, vector_of
 
@@ -116,6 +116,7 @@ class Filter:
         if isinstance(self._kind, str):
             return create(self._kind, self._model, lanes=self._lanes, options=self._options, lane=self._first)
         made = self._kind(self._model, self._lanes, **self._options)
+        check_actuator(made, self._model)
         begin_at = getattr(made, "begin_at", None)
         if begin_at is not None:
             begin_at(self._first)

@@ -11,6 +11,7 @@ from annotated_types import Ge, Le
 from numpy.typing import NDArray
 
 from testbed.estimator.fates import fates_of
+from testbed.estimator.hold import kept, of_state, prior_of, refuse_moments, renewed, size_of, with_input
 from testbed.estimator.mixtures import IMPOSSIBLE, Part, all_merged
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.riccati import Gain, log_odds, phi, predict
@@ -44,15 +45,19 @@ class Gpb:
     2^(d+1) of them, and then merges the pairs that differ in the oldest bit. So it is OE up to step d + 1.
 
     Components are arrays of shape (H · M,), the M lanes of hypothesis 0 first; the bits of a hypothesis' number are the
-    fates of the last packets, the newest in the highest bit.
+    fates of the last packets, the newest in the highest bit. With an actuator that holds, they are Gaussians of
+    (x, a), a the input applied last (see ``hold``).
     """
 
     STATE_VERSION: ClassVar[int] = 1
+    takes_hold: ClassVar[bool] = True
 
     def __init__(self, model: Model, lanes: int, order: Annotated[int, Ge(0), Le(MAX_ORDER)] = 2) -> None:
         self._model, self._lanes, self._order = model, lanes, order
-        self._x: Vector = [np.full(lanes, float(v)) for v in model.x0_mean]
-        self._p = symmetric(model.n, lambda i, j: np.full(lanes, float(model.P0[i, j])))
+        self._size = size_of(model)
+        x, p = prior_of(model, lanes)
+        self._x: Vector = [np.array(np.broadcast_to(v, lanes)) for v in x]
+        self._p = symmetric(self._size, lambda i, j: np.array(np.broadcast_to(p[i][j], lanes)))
         self._score: Floats = np.zeros(lanes)
         self._bits = 0  # told apart
         self._fates = fates_of(model.law)
@@ -67,17 +72,22 @@ class Gpb:
             self._learn(ack)
         priors = self._priors(acks)
         size = len(self._score)
-        shift = model.control_effect(_repeated(u, size)) if model.q else [np.zeros(size)] * model.n
+        if model.holds:
+            control = _repeated(u, size)
+        else:
+            control = model.control_effect(_repeated(u, size)) if model.q else [np.zeros(size)] * model.n
         mask = np.tile(np.asarray(arrived, dtype=np.bool_), size // self._lanes)
-        given: list[Any] = [self._x, self._p, shift, _repeated(y, size)]
+        given: list[Any] = [self._x, self._p, control, _repeated(y, size)]
         if size == 1:
             given = [_mapped(_number, value) for value in given]
         gamma = bool(mask[0]) if size == 1 else mask
-        out = _stepper(model, _kind(size))(gamma, *given)
-        idle, moved, covariance, *gained = (_mapped(partial(_array, size=size), value) for value in out)
+        out = (_held_stepper if model.holds else _stepper)(model, _kind(size))(gamma, *given)
+        idle, moved, *covariances, lost, delivered = (_mapped(partial(_array, size=size), value) for value in out)
+        gained = lost, delivered
         scores = [self._score + prior + plus for prior, plus in zip(priors, gained, strict=True)]
         self._x = [np.concatenate(pair) for pair in zip(idle, moved, strict=True)]
-        self._p = symmetric(model.n, lambda i, j: np.concatenate([covariance[i][j]] * 2))
+        first, second = covariances[0], covariances[-1]
+        self._p = symmetric(self._size, lambda i, j: np.concatenate([first[i][j], second[i][j]]))
         self._score = np.concatenate(scores)
         self._bits += 1
         self._fates.branch()
@@ -88,7 +98,10 @@ class Gpb:
         return estimate
 
     def state(self) -> State:
-        """x (n, S), P (n, n, S), score (S,), S = 2^bits · M, and what is known of the fate of the next packet."""
+        """x (n, S), P (n, n, S), score (S,), S = 2^bits · M, and what is known of the fate of the next packet.
+
+        n + q in place of n with an actuator that holds.
+        """
         arrays = {"x": self._x, "P": self._p, "score": self._score, **self._fates.state()}
         numbers = {"k": self._k, "bits": self._bits}
         return {name: np.array(value, dtype=np.int64) for name, value in numbers.items()} | {
@@ -96,7 +109,7 @@ class Gpb:
         }
 
     def set_state(self, state: State) -> None:
-        n, lanes = self._model.n, self._lanes
+        n, lanes = self._size, self._lanes
         given = Given(state, lanes, n)
         bits = given.integer("bits", min(given.step, self._order))
         size = lanes * 2**bits
@@ -108,9 +121,13 @@ class Gpb:
         self._x, self._p = list(x), symmetric(n, lambda i, j: p[i, j])
 
     def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
-        n, lanes = self._model.n, self._lanes
+        n, lanes, model = self._model.n, self._lanes, self._model
+        refuse_moments(model, step)
         start_of(step, x_hat, P, lanes, n)
         self._x, self._p = [x_hat[:, i].copy() for i in range(n)], symmetric(n, lambda i, j: P[:, i, j].copy())
+        if model.holds:
+            nothing = [np.zeros(lanes) for _ in range(model.q)]
+            self._x, self._p = _mapped(partial(_array, size=lanes), with_input(self._x, self._p, nothing))
         self._k, self._bits, self._score = step, 0, np.zeros(lanes)
         self._fates.start_from(step, lanes)
 
@@ -155,6 +172,8 @@ class Gpb:
         while len(score) > self._lanes:
             low, high = (_mapped(partial(_half, upper=upper), (x, p, score)) for upper in (False, True))
             x, p, score = _pairs_merged(self._model, low, high)
+        if self._model.holds:
+            x, p = of_state(self._model, x, p)
         if self._lanes == 1:
             x, p = _mapped(_number, x), _mapped(_number, p)
         return Estimate(x, p, self._lanes)
@@ -181,12 +200,20 @@ def _advance(
     return idle, add(idle, shift), phi(covariance, gain, gamma), lost, delivered
 
 
+def _advance_held(
+    model: Model, gamma: Mask, z: Vector, P: Matrix, u: Vector, y: Vector
+) -> tuple[Vector, Vector, Matrix, Matrix, Component, Component]:
+    """The mean of (x, a) for ν = 0 and for ν = 1, their covariances, and the log-likelihoods of both."""
+    (idle, first, lost), (moved, second, delivered) = kept(model, gamma, z, P, y), renewed(model, gamma, z, P, u, y)
+    return idle, moved, first, second, lost, delivered
+
+
 def _merge(x: Vector, P: Matrix, score: Component, z: Vector, R: Matrix, other: Component) -> Part:
     return all_merged([(x, P, score), (z, R, other)])
 
 
-def _shapes(model: Model) -> tuple[Shape, ...]:
-    return ("vector", model.n), ("symmetric", model.n), ("scalar", 1)
+def _shapes(model: Model) -> tuple[Shape, Shape, Shape]:
+    return ("vector", size_of(model)), ("symmetric", size_of(model)), ("scalar", 1)
 
 
 @lru_cache(maxsize=16)
@@ -196,6 +223,14 @@ def _stepper(model: Model, lanes: int) -> Step:
     number: Shape = ("scalar", 1)
     arguments: tuple[Shape, ...] = (mean, covariance, mean, ("vector", model.p))
     return masked_step(partial(_advance, model), arguments, (mean, mean, covariance, number, number), lanes)
+
+
+@lru_cache(maxsize=16)
+def _held_stepper(model: Model, lanes: int) -> Step:
+    mean, covariance, number = _shapes(model)
+    arguments: tuple[Shape, ...] = (mean, covariance, ("vector", model.q), ("vector", model.p))
+    results: tuple[Shape, ...] = (mean, mean, covariance, covariance, number, number)
+    return masked_step(partial(_advance_held, model), arguments, results, lanes)
 
 
 @lru_cache(maxsize=16)

@@ -10,8 +10,10 @@ from functools import lru_cache, partial, reduce
 from itertools import chain
 from typing import Any, ClassVar
 
+import numpy as np
 from numpy.typing import NDArray
 
+from testbed.estimator.hold import kept, of_state, prior_of, refuse_moments, renewed, size_of, with_input
 from testbed.estimator.mixtures import (
     IMPOSSIBLE,
     Part,
@@ -34,6 +36,7 @@ from testbed.numerics.lanes import (
     array_of,
     constant_times,
     full,
+    full_vector,
     larger,
     mask_of,
     subtract,
@@ -46,14 +49,18 @@ from testbed.numerics.symbols import Shape
 
 
 class Imm:
-    """A Gaussian for each state of the losses: mixed by their chain, one filter each, weighed by likelihood."""
+    """A Gaussian for each state of the losses: mixed by their chain, one filter each, weighed by likelihood.
+
+    With an actuator that holds, they are Gaussians of (x, a), a the input applied last (see ``hold``).
+    """
 
     STATE_VERSION: ClassVar[int] = 1
+    takes_hold: ClassVar[bool] = True
 
     def __init__(self, model: Model, lanes: int) -> None:
         self._model, self._lanes = model, lanes
         self._advance = _stepper(model, lanes)
-        x, p = model.prior(lanes)
+        x, p = prior_of(model, lanes)
         states = len(model.law.arrived)
         self._modes = [part for h in range(states) for part in (x, p, full(IMPOSSIBLE if h else 0.0, lanes))]
         self._delivered: tuple[Component, Component] = (full(0.0, lanes), full(0.0, lanes))
@@ -74,6 +81,8 @@ class Imm:
         given = (*chain.from_iterable(rows), *self._barred(acks), vector_of(u), vector_of(y))
         x, p, lost, delivered, *self._modes = self._advance(gamma, *self._modes, *given)
         self._delivered = lost, delivered
+        if self._model.holds:
+            x, p = of_state(self._model, x, p)
         return Estimate(x, p, self._lanes)
 
     def state(self) -> State:
@@ -86,14 +95,18 @@ class Imm:
         given = Given(state, self._lanes, self._model.n)
         modes = []
         for mode in range(len(self._model.law.arrived)):
-            modes += [given.vector(f"x{mode}"), given.matrix(f"P{mode}"), given.component(f"score{mode}")]
+            x, p = given.vector(f"x{mode}", size_of(self._model)), given.matrix(f"P{mode}", size_of(self._model))
+            modes += [x, p, given.component(f"score{mode}")]
         delivered = given.component("lost"), given.component("delivered")
         given.end()
         self._k, self._modes, self._delivered = given.step, modes, delivered
 
     def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
         law, lanes = self._model.law, self._lanes
+        refuse_moments(self._model, step)
         x, p = start_of(step, x_hat, P, lanes, self._model.n)
+        if self._model.holds:
+            x, p = with_input(x, p, full_vector(np.zeros(self._model.q), lanes))
         weights = last_law(law, step).tolist() if step else [1.0, *[0.0] * (len(law.arrived) - 1)]
         self._modes = [part for weight in weights for part in (x, p, full(score_of(weight), lanes))]
         lost, delivered = (sum(weights[h] for h in law.states_of(fate)) if step else 0.0 for fate in (False, True))
@@ -120,6 +133,11 @@ def _advance(model: Model, gamma: Mask, *given: Any) -> tuple[Any, ...]:
     after: list[Part] = []
     for h, nu in enumerate(fates):
         x, P, score = all_merged([(m, p, s + moves[i * count + h]) for i, (m, p, s) in enumerate(modes)])
+        if model.holds:
+            score = score + (bar1 if nu else bar0)
+            mean, covariance, gained = renewed(model, gamma, x, P, u, y) if nu else kept(model, gamma, x, P, y)
+            after.append((mean, covariance, score + gained))
+            continue
         mean, covariance = constant_times(model.a, x), predict(model.a, P, model.noise)
         if nu and model.q:
             mean = add(mean, model.control_effect(u))
@@ -140,8 +158,8 @@ def _advance(model: Model, gamma: Mask, *given: Any) -> tuple[Any, ...]:
 
 @lru_cache(maxsize=16)
 def _stepper(model: Model, lanes: int) -> Step:
-    mean: Shape = ("vector", model.n)
-    covariance: Shape = ("symmetric", model.n)
+    mean: Shape = ("vector", size_of(model))
+    covariance: Shape = ("symmetric", size_of(model))
     number: Shape = ("scalar", 1)
     states = len(model.law.arrived)
     modes = (mean, covariance, number) * states

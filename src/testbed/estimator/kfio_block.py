@@ -64,8 +64,14 @@ def filter_block(
 
     The interpreter is free meanwhile: threads may filter blocks of different lanes side by side.
 
-    Raises UsageError for a shape that does not fit and MissingAck where ν is needed and missing.
+    Raises UsageError for a shape that does not fit, and with an actuator that holds; MissingAck where ν is needed and
+    missing.
     """
+    if model.holds:
+        raise UsageError(
+            'filter_block: got a model with on_loss = "hold"; allowed: one whose control link never loses, with the '
+            "u that was applied (testbed.estimator.hold.applied_inputs)"
+        )
     arrived = np.asarray(arrived)
     if arrived.ndim != 2:
         raise UsageError(f"arrived: got the shape {arrived.shape}; allowed: (steps, lanes)")

@@ -26,11 +26,14 @@ from testbed.numerics.lanes import (
     matrices_of,
     where,
 )
+from testbed.scenario import OnLoss
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
     """x⁺ = A x + ν B u + w, y = C x + v (theory.md section 1); Q with G already applied.
+
+    on_loss "hold": x⁺ = A x + B a + w, with the applied input a_k = ν_k u_k + (1 − ν_k) a_{k−1}, a_{−1} = 0.
 
     A (n, n), B (n, q) or None, C (p, n), Q (n, n), R (p, p), x0_mean (n,), P0 (n, n); control: law of ν_0, ν_1, …;
     observation: law of γ_1, γ_2, …
@@ -53,6 +56,12 @@ class Model:
     dA: tuple[Floats, ...] = ()
     dG: tuple[Floats, ...] = ()
     dC: tuple[Floats, ...] = ()
+    on_loss: OnLoss = "zero"
+
+    @cached_property
+    def holds(self) -> bool:
+        """Whether the plant may apply an input once more: where nothing is lost, hold is the same as zero."""
+        return self.on_loss == "hold" and self.q > 0 and not self.control.never_loses
 
     @property
     def n(self) -> int:
@@ -136,7 +145,8 @@ class Estimator(Protocol):
     """One step = the move from k − 1 to k, then the observation of k.
 
     It may also have ``check_scenario`` (see registry.check), ``begin_at`` (see registry.create), ``takes_noise`` (see
-    ``seen``), ``not_claimed`` (see conformance), and what makes it a ``Restartable``.
+    ``seen``), ``takes_hold`` (see registry.check_actuator), ``not_claimed`` (see conformance), and what makes it a
+    ``Restartable``.
     """
 
     counters: dict[str, int]

@@ -21,7 +21,11 @@ from testbed.numerics.ragged import packed, unpacked
 from testbed.scenario import Scenario
 
 ENUMERATED = {1: 4096, 2: 4096, 3: 512}
-"""Histories from which a lane goes to the lattice, for one, two and three states; above, there is none."""
+"""Histories from which a lane goes to the lattice, for one, two and three states; above, there is none.
+
+Nor with an actuator that holds: the components then differ in the input applied last too, of which there are as many
+values as steps, and the certificate is for one lattice a hidden state of the losses.
+"""
 
 
 class Oe(OeExact):
@@ -29,7 +33,8 @@ class Oe(OeExact):
 
     tolerance: aim of ``error_bound``, the bound on ‖x̂ − exact‖ in units of sqrt(tr P), for a run of any length; 0 in
     the estimates that are exact. max_histories: histories that are enumerated before the posterior goes to a lattice,
-    by default 4096, or 512 for three states; above three there is no lattice, and it is the limit, by default 65536.
+    by default 4096, or 512 for three states; above three, and with an actuator that holds, there is no lattice, and it
+    is the limit, by default 65536.
     max_lag: how many steps late an ACK may be and still be used once its packet's fates are merged.
     """
 
@@ -43,8 +48,8 @@ class Oe(OeExact):
         max_histories: Annotated[int, Ge(1)] | None = None,
         max_lag: Annotated[int, Ge(0)] = 64,
     ) -> None:
-        self._lattice = model.n in ENUMERATED
-        limit = max_histories or ENUMERATED.get(model.n, MAX_HISTORIES)
+        self._lattice = model.n in ENUMERATED and not model.holds
+        limit = max_histories or (ENUMERATED[model.n] if self._lattice else MAX_HISTORIES)
         self._beyond: dict[int, Lane] = {}
         super().__init__(model, lanes, limit)
         self._settings = Settings(model, self._fates, tolerance, limit, max_lag)

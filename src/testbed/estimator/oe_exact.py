@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from testbed.errors import UsageError
 from testbed.estimator.errors import ContradictoryAck, TooManyHistories
+from testbed.estimator.hold import refuse_moments
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.posterior import Fates
 from testbed.estimator.riccati import Gain, phi, predict
@@ -26,6 +27,7 @@ from testbed.numerics.lanes import (
     Component,
     Floats,
     Vector,
+    add,
     constant_times,
     dot,
     mask_of,
@@ -48,6 +50,7 @@ class Group:
     weights up to a constant a lane, the largest 0, so that no history that data may yet revive underflows;
     H = 2^undecided: the bits of a hypothesis' index are the fates of the undecided packets, the newest in the lowest
     bit; hidden (S, G, H): law of the link's hidden state at the newest packet, given the history.
+    applied: q arrays (G, H), the input applied last, of an actuator that holds; else none.
     """
 
     lanes: NDArray[np.intp]
@@ -55,21 +58,26 @@ class Group:
     means: list[Floats]
     scores: Floats
     hidden: Floats
+    applied: list[Floats]
 
     def select(self, rows: NDArray[np.bool_]) -> Group:
         means = [m[rows] for m in self.means]
-        return Group(self.lanes[rows], self.undecided, means, self.scores[rows], self.hidden[:, rows])
+        applied = [a[rows] for a in self.applied]
+        return Group(self.lanes[rows], self.undecided, means, self.scores[rows], self.hidden[:, rows], applied)
 
 
 class OeExact:
     """The minimum mean square error estimator, exact, while 2^(undecided packets) ≤ ``max_histories``."""
 
     STATE_VERSION: ClassVar[int] = 1
+    takes_hold: ClassVar[bool] = True
     _name, _other = "oe-exact", "oe"
 
     def __init__(self, model: Model, lanes: int, max_histories: Annotated[int, Ge(1)] = MAX_HISTORIES) -> None:
         self._model, self._lanes, self._limit = model, lanes, max_histories
         self._fates = Fates(model.law)
+        if model.holds:
+            self._other = "gpb"  # there is no lattice
         self.counters: dict[str, int] = {}
         x_hat, P = np.tile(model.x0_mean, (lanes, 1)), np.tile(model.P0, (lanes, 1, 1))
         self.start_from(0, x_hat, P)
@@ -86,10 +94,12 @@ class OeExact:
 
     def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
         """Begin behind ``step`` with N(x_hat, P), (M, n) and (M, n, n), in each lane, knowing of no loss before."""
+        refuse_moments(self._model, step)
         _, covariance = start_of(step, x_hat, P, self._lanes, self._model.n)
         law = np.repeat(self._fates.at(step), self._lanes).reshape(-1, self._lanes, 1)
         means = [x_hat[:, i : i + 1].astype(np.float64) for i in range(self._model.n)]
-        self._groups = [Group(np.arange(self._lanes), (), means, np.zeros((self._lanes, 1)), law)]
+        held = [np.zeros((self._lanes, 1)) for _ in range(self._model.q)] if self._model.holds else []
+        self._groups = [Group(np.arange(self._lanes), (), means, np.zeros((self._lanes, 1)), law, held)]
         self._p = covariance
         self._k, self._first = step, step
 
@@ -102,6 +112,7 @@ class OeExact:
                 "means": np.stack(group.means),
                 "scores": group.scores,
                 "hidden": group.hidden,
+                **({"applied": np.stack(group.applied)} if group.applied else {}),
             }
             for group in self._groups
         ]
@@ -128,17 +139,27 @@ class OeExact:
 
     def _take(self, state: State) -> None:
         self._groups = [
-            Group(part["lanes"], tuple(part["undecided"].tolist()), list(part["means"]), part["scores"], part["hidden"])
+            Group(
+                part["lanes"],
+                tuple(part["undecided"].tolist()),
+                list(part["means"]),
+                part["scores"],
+                part["hidden"],
+                list(part["applied"]) if self._model.holds else [],
+            )
             for part in unpacked("group.", state)
         ]
 
     def _consistent(self) -> bool:
         """Whether the shapes fit one another and each lane is in one place."""
         n, states = self._model.n, self._fates.states
+        channels = self._model.q if self._model.holds else 0
         for group in self._groups:
             size = len(group.lanes), 2 ** len(group.undecided)
             shapes = [*(m.shape for m in group.means), group.scores.shape, *(h.shape for h in group.hidden)]
-            if len(group.means) != n or len(group.hidden) != states or set(shapes) != {size}:
+            shapes += [a.shape for a in group.applied]
+            counts = len(group.means), len(group.hidden), len(group.applied)
+            if counts != (n, states, channels) or set(shapes) != {size}:
                 return False
         held = sorted(int(i) for group in self._groups for i in group.lanes)
         return sorted([*held, *self._elsewhere()]) == list(range(self._lanes)) and 0 <= self._first <= self._k
@@ -158,10 +179,12 @@ class OeExact:
         model, gamma = self._model, mask_of(arrived)
         self._k += 1
         packet = self._k - 1
-        push = [np.broadcast_to(b, self._lanes) for b in model.control_effect(vector_of(u))] if model.q else []
+        sent = vector_of(u)
+        push = [np.broadcast_to(b, self._lanes) for b in model.control_effect(sent)] if model.q else []
         for ack in acks:
             self._learn(ack, packet)
-        branches = [self._branch(group, packet, push, acks) for group in self._groups_by_ack(acks, packet)]
+        held = [np.broadcast_to(v, self._lanes) for v in sent] if model.holds else []
+        branches = [self._branch(group, packet, push, held, acks) for group in self._groups_by_ack(acks, packet)]
         self._groups = [group for group in branches if group is not None]
         covariance = predict(model.a, self._p, model.noise)
         gain = Gain(covariance, model.c, model.sensor_noise)
@@ -200,8 +223,11 @@ class OeExact:
             groups += [group.select(rows) for rows in (here, ~here) if rows.any()]
         return groups
 
-    def _branch(self, group: Group, packet: int, push: Vector, acks: tuple[Ack, ...]) -> Group | None:
-        """One move of the plant: each hypothesis splits in two, or none does where ν is known."""
+    def _branch(self, group: Group, packet: int, push: Vector, sent: Vector, acks: tuple[Ack, ...]) -> Group | None:
+        """One move of the plant: each hypothesis splits in two, or none does where ν is known.
+
+        push: B u; sent: u with an actuator that holds, else nothing.
+        """
         model = self._model
         nu = self._known_nu(group, packet, acks)
         if nu is None and 2 * group.scores.shape[1] > self._limit:
@@ -209,16 +235,25 @@ class OeExact:
         moved = [np.broadcast_to(m, group.scores.shape) for m in constant_times(model.a, list(group.means))]
         shift = [b[group.lanes][:, None] for b in push] or [np.zeros((len(group.lanes), 1))] * model.n
         hidden, chances = self._split(group)
+        idle = moved
+        if model.holds:
+            idle = add(moved, constant_times(model.b, list(group.applied)))
+        fresh = [np.broadcast_to(v[group.lanes][:, None], group.scores.shape) for v in sent]
         if nu is not None:
-            means = [m + nu[:, None] * s for m, s in zip(moved, shift, strict=True)]
             delivered = nu[:, None] == 1.0
+            applied = [np.where(delivered, new, old) for new, old in zip(fresh, group.applied, strict=True)]
+            if model.holds:
+                means = add(moved, constant_times(model.b, list(applied)))
+            else:
+                means = [m + nu[:, None] * s for m, s in zip(moved, shift, strict=True)]
             scores = group.scores + _log(np.where(delivered, chances[1], chances[0]))
             law = np.where(delivered, hidden[1], hidden[0])
-            return Group(group.lanes, group.undecided, means, _levelled(scores), law)
-        means = [_interleave(m, m + s) for m, s in zip(moved, shift, strict=True)]
+            return Group(group.lanes, group.undecided, means, _levelled(scores), law, applied)
+        means = [_interleave(i, m + s) for i, m, s in zip(idle, moved, shift, strict=True)]
+        applied = [_interleave(old, new) for old, new in zip(group.applied, fresh, strict=True)]
         scores = _interleave(group.scores + _log(chances[0]), group.scores + _log(chances[1]))
         law = np.stack([_interleave(a, b) for a, b in zip(*hidden, strict=True)])
-        return Group(group.lanes, (*group.undecided, packet), means, scores, law)
+        return Group(group.lanes, (*group.undecided, packet), means, scores, law, applied)
 
     def _overflow(self, group: Group) -> Group | None:
         """What becomes of lanes whose hypotheses would pass the limit."""
@@ -261,7 +296,7 @@ class OeExact:
         updated = _levelled(group.scores + log_likelihood)
         means = [np.where(here[:, None], m + dot(row, innovation), m) for m, row in zip(group.means, k, strict=True)]
         scores = np.where(here[:, None], updated, group.scores)
-        return Group(group.lanes, group.undecided, means, scores, group.hidden)
+        return Group(group.lanes, group.undecided, means, scores, group.hidden, group.applied)
 
     def _moments(self, mean: Floats, spread: Floats) -> None:
         """Mean (M, n) and covariance of the means (M, n, n) of the lanes that are enumerated."""
@@ -319,7 +354,8 @@ def _decide(group: Group, j: int, nu: NDArray[Any]) -> Group:
 
     undecided = tuple(i for i in group.undecided if i != j)
     hidden = np.stack([keep(h) for h in group.hidden])
-    return Group(group.lanes, undecided, [keep(m) for m in group.means], _levelled(keep(group.scores)), hidden)
+    means, applied = [keep(m) for m in group.means], [keep(a) for a in group.applied]
+    return Group(group.lanes, undecided, means, _levelled(keep(group.scores)), hidden, applied)
 
 
 def _joined(groups: list[Group]) -> list[Group]:
@@ -338,4 +374,5 @@ def _concatenated(groups: list[Group]) -> Group:
         [np.concatenate([g.means[i] for g in groups]) for i in range(len(first.means))],
         np.concatenate([g.scores for g in groups]),
         np.concatenate([g.hidden for g in groups], axis=1),
+        [np.concatenate([g.applied[i] for g in groups]) for i in range(len(first.applied))],
     )

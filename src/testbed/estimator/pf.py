@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from testbed.channel.law import Law
 from testbed.errors import UsageError
+from testbed.estimator.hold import refuse_moments
 from testbed.estimator.mixtures import IMPOSSIBLE
 from testbed.estimator.model import Ack, Estimate, Model
 from testbed.estimator.state import Given, State, last_law, start_of
@@ -31,11 +32,15 @@ from testbed.numerics.streams import LaneStream
 
 @dataclass
 class _Cloud:
-    """Particles of one lane: x, n arrays (N,); states (N,), the last of the losses; scores (N,), logs of weights."""
+    """Particles of one lane: x, n arrays (N,); states (N,), the last of the losses; scores (N,), logs of weights.
+
+    applied: q arrays (N,), the input applied last, of an actuator that holds; else none.
+    """
 
     x: Vector
     states: NDArray[np.intp] | None
     scores: Floats
+    applied: Vector
 
 
 class Pf:
@@ -46,6 +51,7 @@ class Pf:
     """
 
     STATE_VERSION: ClassVar[int] = 1
+    takes_hold: ClassVar[bool] = True
     not_claimed: ClassVar[dict[str, str]] = {
         "coordinates": "its draws depend on the coordinates",
         "kfio_with_acks": "its mean and covariance are those of a sample",
@@ -93,7 +99,10 @@ class Pf:
         return Estimate(vector_of(x_hat), matrix_of(P), self._lanes)
 
     def state(self) -> State:
-        """x (M, n, N), scores (M, N), from the first step on states (M, N); ``lane``, the number of the first lane."""
+        """x (M, n, N), scores (M, N), from the first step on states (M, N); ``lane``, the number of the first lane.
+
+        applied (M, q, N) with an actuator that holds.
+        """
         clouds = self._begun()
         out: State = {
             "k": np.array(self._k, dtype=np.int64),
@@ -101,6 +110,8 @@ class Pf:
             "x": np.array([cloud.x for cloud in clouds]),
             "scores": np.array([cloud.scores for cloud in clouds]),
         }
+        if self._model.holds:
+            out["applied"] = np.array([cloud.applied for cloud in clouds])
         if self._k:
             out["states"] = np.array([cloud.states for cloud in clouds], dtype=np.int64)
         return out
@@ -117,12 +128,17 @@ class Pf:
             if not ((known >= 0) & (known <= largest)).all():
                 raise UsageError(f"state: 'states' holds what is not one; allowed: 0 … {largest}")
             states = list(known)
+        held = given.array("applied", np.float64, lanes, self._model.q, particles) if self._model.holds else None
         given.end()
         self._k, self._first = given.step, first
-        self._clouds = [_Cloud(list(x[lane]), states[lane], scores[lane]) for lane in range(lanes)]
+        self._clouds = [
+            _Cloud(list(x[lane]), states[lane], scores[lane], [] if held is None else list(held[lane]))
+            for lane in range(lanes)
+        ]
 
     def start_from(self, step: int, x_hat: Floats, P: Floats) -> None:
         """Draws the particles from N(x̂, P), with streams of their own."""
+        refuse_moments(self._model, step)
         start_of(step, x_hat, P, self._lanes, self._model.n)
         streams = [LaneStream(self._seed, "estimator.pf", f"start.{part}") for part in ("noise", "control")]
         self._k, self._clouds = step, []
@@ -146,7 +162,8 @@ class Pf:
         normals = stream.normals(lane, self._k, n * particles).reshape(n, particles)
         spread = constant_times(_root(covariance), list(normals))
         x = [np.full(particles, m) + s for m, s in zip(mean, spread, strict=True)]
-        return _Cloud(x, None, np.zeros(particles))
+        held = [np.zeros(particles) for _ in range(self._model.q)] if self._model.holds else []
+        return _Cloud(x, None, np.zeros(particles), held)
 
     def _draws(self, lane: int) -> tuple[Vector, Floats]:
         n, particles = self._model.n, self._particles
@@ -181,6 +198,10 @@ class Pf:
             nu = np.full(self._particles, fate)
             cloud.states = _among(law, moves, nu, points * chance)
         x = add(constant_times(model.a, cloud.x), constant_times(self._root, normals))
+        if model.holds:
+            cloud.applied = [np.where(nu, float(new), old) for new, old in zip(u, cloud.applied, strict=True)]
+            cloud.x = add(x, model.control_effect(cloud.applied))
+            return
         push = model.control_effect([float(v) for v in u]) if model.q else [0.0] * model.n
         cloud.x = [m + np.where(nu, b, 0.0) for m, b in zip(x, push, strict=True)]
 
@@ -229,6 +250,7 @@ def _resample(cloud: _Cloud, weights: Floats, uniform: float) -> None:
     chosen = np.searchsorted(np.cumsum(weights), (uniform + np.arange(count)) / count, side="right")
     chosen = np.minimum(chosen, count - 1)
     cloud.x = [component[chosen] for component in cloud.x]
+    cloud.applied = [component[chosen] for component in cloud.applied]
     cloud.states = None if cloud.states is None else cloud.states[chosen]
     cloud.scores = np.zeros(count)
 

@@ -15,7 +15,7 @@ from typing import Any, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from testbed.channel.in_time import law_in_steps
+from testbed.channel.in_time import law_of_link
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.model import Estimator, Model
 from testbed.scenario import EstimatorSpec, Scenario
@@ -56,6 +56,7 @@ def create(
     """
     factory = factory_of(kind)
     made = factory(model, lanes, **checked_options(kind, factory, dict(options or {})))
+    check_actuator(made, model)
     begin_at = getattr(made, "begin_at", None)
     if begin_at is not None:
         begin_at(lane)
@@ -66,6 +67,18 @@ def kind_of(estimator: Estimator) -> str:
     """The name of a built-in estimator, MODULE:CLASS of another."""
     path = f"{type(estimator).__module__}:{type(estimator).__qualname__}"
     return next((kind for kind, known in BUILT_IN.items() if known == path), path)
+
+
+def check_actuator(estimator: Estimator, model: Model) -> None:
+    """Raises UsageError where the actuator holds its last input and the estimator does not have ``takes_hold = True``.
+
+    One that is not made for it would be wrong without a word.
+    """
+    if model.holds and not getattr(estimator, "takes_hold", False):
+        raise UsageError(
+            f"estimator {kind_of(estimator)!r} is for an actuator that applies zero on a loss, and this one has "
+            'on_loss = "hold"; allowed: "zero", or an estimator that knows the input applied last (gpb, oe-exact)'
+        )
 
 
 def check(spec: EstimatorSpec, model: Model, *, acks: str, scenario: Scenario) -> None:
@@ -96,13 +109,14 @@ def model_of(scenario: Scenario) -> Model:
         R=np.array(system.R),
         x0_mean=np.array(system.x0_mean),
         P0=np.array(system.P0),
-        control=law_in_steps(scenario.links.control, scenario.clock.period_ns),
-        observation=law_in_steps(scenario.links.observation, scenario.clock.period_ns),
+        control=law_of_link(scenario, "control"),
+        observation=law_of_link(scenario, "observation"),
         G=g,
         W=np.array(system.Q),
         dA=tuple(np.array(d) for d in d_a),
         dG=tuple(np.array(d) for d in d_g),
         dC=tuple(np.array(d) for d in d_c),
+        on_loss=scenario.actuator.on_loss,
     )
 
 

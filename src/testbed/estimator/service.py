@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.channel.service import is_timed
 from testbed.errors import RunFailed
 from testbed.estimator.model import Ack, Estimator, Restartable, seen
 from testbed.estimator.refilter import LateObservation, Refilter
@@ -45,10 +46,7 @@ def buffer_of(scenario: Scenario, spec: EstimatorSpec) -> int:
     """Steps that an estimator can go back: as its table says, or as many as are of use."""
     if spec.buffer is not None:
         return spec.buffer
-    links = scenario.links
-    late = links.observation.takes_time
-    if acks_of(scenario, spec) == "link":
-        late = late or links.ack.takes_time or links.ack.batch > 1
+    late = is_timed(scenario, "observation") or (acks_of(scenario, spec) == "link" and is_timed(scenario, "ack"))
     return BUFFER if late else 0
 
 

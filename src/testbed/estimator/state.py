@@ -54,13 +54,15 @@ class Given:
         array = self.array(name, np.float64, self._lanes)
         return float(array[0]) if self._lanes == 1 else array
 
-    def vector(self, name: str) -> Vector:
-        return vector_of(self.array(name, np.float64, self._lanes, self._n))
+    def vector(self, name: str, size: int | None = None) -> Vector:
+        """Of n components, or of ``size``."""
+        return vector_of(self.array(name, np.float64, self._lanes, self._n if size is None else size))
 
-    def matrix(self, name: str) -> Matrix:
-        """A symmetric one; what is above the diagonal counts."""
-        matrix = matrix_of(self.array(name, np.float64, self._lanes, self._n, self._n))
-        return symmetric(self._n, lambda i, j: matrix[i][j])
+    def matrix(self, name: str, size: int | None = None) -> Matrix:
+        """A symmetric one, n × n or of ``size``; what is above the diagonal counts."""
+        n = self._n if size is None else size
+        matrix = matrix_of(self.array(name, np.float64, self._lanes, n, n))
+        return symmetric(n, lambda i, j: matrix[i][j])
 
     def array(self, name: str, dtype: Any, *shape: int) -> NDArray[Any]:
         self._read.add(name)

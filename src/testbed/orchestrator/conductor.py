@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
+from testbed.channel.service import is_timed
 from testbed.channel.service import role_of as link_role
+from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.bounds_service import ROLE as BOUNDS
 from testbed.estimator.service import role_of as estimator_role
 from testbed.orchestrator.collect import Collector
 from testbed.orchestrator.recorder import Recorder
+from testbed.orchestrator.summary import Happened
 from testbed.plant.controller import ROLE as CONTROLLER
 from testbed.plant.service import ROLE as PLANT
+from testbed.scenario.changes import in_turn
 from testbed.wire.bus import Bus
 from testbed.wire.codec import encode
 from testbed.wire.keys import LinkName
 from testbed.wire.messages import (
     Acknowledgement,
     BoundsMessage,
+    Change,
     ClockMessage,
     Command,
     Control,
@@ -34,6 +42,15 @@ from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.setup import Setup
 
 Arrays = dict[str, NDArray[Any]]
+
+
+class Asked(BaseModel):
+    """What somebody asks of a run that goes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    link: str
+    set: dict[str, Any]
 
 
 class Conductor:
@@ -58,7 +75,15 @@ class Conductor:
         self.node = Node(bus, setup.run, ORCHESTRATOR, setup.sizes)
         self._clock, self._command = bus.publisher(self.node.keys.clock), bus.publisher(self.node.keys.command)
         self._clock_seq = 0
+        self._tell_link = {link: bus.publisher(self.node.keys.change(link)) for link in get_args(LinkName)}
+        self._changes: Counter[str] = Counter()
+        self.events = [
+            Happened(step=event.step(setup.scenario.clock.period_ns), by="timeline", link=event.link, set=event.set)
+            for event in setup.scenario.events
+        ]
+        """What changes, or has changed, at which step."""
         self._subscribe()
+        bus.answer(self.node.keys.ask, self._asked)
         bus.answer(self.node.keys.scenario, lambda _: setup.to_json())
         self.node.announce()
         bus.watch(self.node.keys.presence("*"), self._presence)
@@ -85,6 +110,41 @@ class Conductor:
     def awaiting(self) -> str:
         """What the run is waiting for now."""
         return self.collector.awaiting() if self.started else f"roles to join: {', '.join(self.missing)}"
+
+    def change_link(self, link: str, change: dict[str, Any]) -> int:
+        """Let keys of a link have other values from the next step on that is not granted yet; that step.
+
+        Raises UsageError where that cannot be.
+        """
+        names = get_args(LinkName)
+        if link not in names:
+            raise UsageError(f"link {link!r}: no such link; allowed: {', '.join(names)}{did_you_mean(link, names)}")
+        name = cast(LinkName, link)
+        if link_role(name) not in self._roles:
+            raise UsageError(f"link {link!r}: this run has none")
+        if self.over or self._granted >= self._steps:
+            raise UsageError("the run has no step left that could change")
+        event = Happened(step=self._granted + 1, by="command", link=link, set=change)
+        events = sorted((e for e in [*self.events, event] if e.link == link), key=lambda e: e.step)
+        after = in_turn(getattr(self.setup.scenario.links, link), [e.set for e in events])
+        if any(variant.takes_time for variant in after) and not is_timed(self.setup.scenario, name):
+            raise UsageError(
+                f"link {link!r} began without time: allowed in this run: another loss; for more, begin with a delay, "
+                "such as { kind = 'constant', by = '0 s' }"
+            )
+        order = Change(run=self.setup.run, source=ORCHESTRATOR, seq=self._changes[link], step=event.step, set=change)
+        self._changes[link] += 1
+        self.events.append(event)
+        self._tell_link[name](encode(order))
+        return event.step
+
+    def _asked(self, question: bytes) -> bytes:
+        """Answer what somebody asks of the run: {"link": …, "set": {…}}; with {"step": k}, or {"error": …}."""
+        try:
+            asked = Asked.model_validate_json(question)
+            return json.dumps({"step": self.change_link(asked.link, asked.set)}).encode()
+        except (UsageError, ValidationError) as error:
+            return json.dumps({"error": " ".join(str(error).split())}).encode()
 
     def stop(self) -> None:
         """Tell all roles to report and leave."""

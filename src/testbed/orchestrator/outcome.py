@@ -12,7 +12,9 @@ from testbed import __version__
 from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.channel.hidden import Hidden
-from testbed.channel.in_time import law_in_steps
+from testbed.channel.in_time import law_of_link
+from testbed.estimator.bounds import held_factor
+from testbed.estimator.registry import model_of
 from testbed.estimator.service import acks_of, role_of
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import (
@@ -61,6 +63,7 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
             "estimators": estimators,
             "bounds": bounds,
             "links": links,
+            "events": sorted((e for e in conductor.events if e.step <= collector.completed), key=lambda e: e.step),
             "checks": checks,
             "rejected": rejected,
             "timing": timing,
@@ -91,7 +94,7 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
 
 def moment_checks(scenario: Scenario) -> list[Check]:
     """Whether the EEC and the variance of its sample mean can be finite."""
-    A, losses = np.array(scenario.system.A), law_in_steps(scenario.links.observation, scenario.clock.period_ns)
+    A, losses = np.array(scenario.system.A), law_of_link(scenario, "observation")
     order, rho, decay = finite_moment_order(A, losses), spectral_radius(A), losses.burst_decay
     hidden = isinstance(losses, Hidden)
     burst = f"θ = {decay:.6g}" if hidden else f"P(arrival after a loss) = {losses.recovery:.6g}"
@@ -157,7 +160,7 @@ def between_bounds(
 
     The lower bound holds in every lane. The upper one holds in expectation, so that the mean may exceed it by three
     standard errors, and one lane says nothing. M's proof covers i.i.d. control losses; the bound taken is one that
-    holds for those of the run.
+    holds for those of the run. With an actuator that holds it is one for OE alone.
     """
     checks = []
     for name, figures in estimators.items():
@@ -166,7 +169,7 @@ def between_bounds(
         steps = [k for k, mean in enumerate(figures.trace_P_mean) if mean is not None]
         upper, symbol = valid_upper(bounds)
         slack = [3.0 * (e or 0.0) for e in figures.trace_P_stderr]
-        if scenario.lanes == 1:
+        if scenario.lanes == 1 or (figures.kind == "aoe" and model_of(scenario).holds):
             upper, symbol = (None,) * len(bounds.lower_mean), ""
         inside = sum(
             _at_most(bounds.lower_mean[k], figures.trace_P_mean[k])
@@ -227,12 +230,16 @@ def _bounds(conductor: Conductor) -> BoundFigures | None:
     if control_bound(scenario) is None:
         no_bound = "the control is feedback, for which no bound is known"
         return BoundFigures.model_validate({**lower, "upper_reason": no_bound})
+    model = model_of(scenario)
+    if model.holds and held_factor(model.control) is None:
+        no_bound = 'with on_loss = "hold" a bound is known for i.i.d. control losses only'
+        return BoundFigures.model_validate({**lower, "upper_reason": no_bound})
     upper = {"upper_mean": series.mean["upper"], "upper_stderr": series.stderr["upper"]}
     if any(value is not None for value in series.mean["upper_correlated"]):
         upper["upper_correlated_mean"] = series.mean["upper_correlated"]
         upper["upper_correlated_stderr"] = series.stderr["upper_correlated"]
     reason: str | None = None
-    if law_in_steps(scenario.links.control, scenario.clock.period_ns).covariance_factor is None:
+    if law_of_link(scenario, "control").covariance_factor is None:
         reason = "the control losses never mix, and S holds for independent ones"
     if scenario.uncertainty is not None:
         reason = "the bounds are those of the nominal model, and the plant departs from it"

@@ -20,6 +20,7 @@ from testbed.orchestrator.outcome import summarise
 from testbed.orchestrator.preflight import check_estimators, prepare_folder
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.roles import RoleSpec, roles_of
+from testbed.orchestrator.running import published
 from testbed.orchestrator.statistics import Progress
 from testbed.orchestrator.summary import Summary, Timing, write_summary
 from testbed.orchestrator.supervise import Supervisor, command_of
@@ -86,6 +87,7 @@ class Run:
                 cleanup.callback(recorder.close)
             cleanup.callback(supervisor.close, 0.0)
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.window == 1)
+            cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
             conductor = self._conductor(bus, recorder)
             bus.subscribe(conductor.node.keys.warm("*"), lambda _key, _payload: None)
             threading.Thread(target=_import_report, daemon=True).start()

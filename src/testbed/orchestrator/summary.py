@@ -132,6 +132,15 @@ class Check(_Model):
     text: str
 
 
+class Happened(_Model):
+    """An event, and the step at which it took effect."""
+
+    step: NonNegativeInt
+    by: Literal["timeline", "command"] = Field(description="whether the scenario or somebody outside asked for it")
+    link: str = Field(description="which link")
+    set: dict[str, Any] = Field(description="keys of the link that changed")
+
+
 class Timing(_Model):
     """How long the run took; seconds on the wall clock."""
 
@@ -156,6 +165,7 @@ class Summary(_Model):
     estimators: dict[str, EstimatorFigures]
     bounds: BoundFigures | None = None
     links: dict[str, LinkFigures]
+    events: tuple[Happened, ...] = Field(default=(), description="what changed while the run went, in order of time")
     checks: tuple[Check, ...] = ()
     rejected: dict[str, dict[str, NonNegativeInt]] = Field(
         default_factory=dict, description="messages refused, by role and reason"

@@ -1,6 +1,7 @@
 """The plant of one block of lanes: x_{k+1} = A x_k + ν_k B u_k + G w_k, y_k = C x_k + v_k.
 
-With model error A, G and C are A(ε_k), G(ε_k) and C(ε_k); ε_k is that of the step and the lane.
+With model error A, G and C are A(ε_k), G(ε_k) and C(ε_k); ε_k is that of the step and the lane. An actuator that
+holds applies B a_k in place of ν_k B u_k, with a_k = ν_k u_k + (1 − ν_k) a_{k−1} and a_{−1} = 0.
 """
 
 from __future__ import annotations
@@ -21,8 +22,10 @@ from testbed.numerics.lanes import (
     array_of,
     constant,
     constant_times,
+    full_vector,
     vector_of,
     where,
+    where_vector,
 )
 from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.streams import Stream
@@ -57,6 +60,8 @@ class Plant:
         self.x: Vector = [m + s for m, s in zip(system.x0_mean, spread, strict=True)]
         self._noise: Vector = []
         self._k = 0
+        self._held = full_vector(np.zeros(system.q), lanes) if scenario.actuator.on_loss == "hold" else None
+        self._everywhere: Mask = True if lanes == 1 else np.ones(lanes, dtype=np.bool_)
         if uncertainty is not None and self._derivatives is not None:
             self._delta = uncertainty.delta
             self._parameters = stream("uncertainty", uncertainty.parameters)
@@ -73,8 +78,14 @@ class Plant:
         return array_of(constant_times(self._matrices.sensor, self._noise), self._lanes)
 
     def move(self, u: Floats | None, applied: Mask) -> tuple[Floats, Floats]:
-        """One step: apply u (M, q) where ``applied``, zero elsewhere. Returns x_{k+1} (M, n) and y_{k+1} (M, p)."""
+        """One step: apply u (M, q) where ``applied``, elsewhere zero or what was applied last.
+
+        Returns x_{k+1} (M, n) and y_{k+1} (M, p).
+        """
         control = [0.0] * self._matrices.q if u is None else vector_of(u)
+        if self._held is not None:
+            self._held = control = where_vector(applied, control, self._held)
+            applied = self._everywhere
         w, v = self._process.normals(self._k), self._sensor.normals(self._k + 1)
         if self._derivatives is None:
             self.x, y = self._advance(applied, self.x, control, w, v)

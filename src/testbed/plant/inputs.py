@@ -1,4 +1,4 @@
-"""The inputs u_k of theory.md section 1, and the bound U ≥ B u_k u_k' B' that the upper bound S needs."""
+"""The inputs u_k of theory.md section 1, and the bound U on what they can do that the upper bound S needs."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ def deterministic(scenario: Scenario) -> Callable[[NDArray[np.int64]], Floats]:
 def control_bound(scenario: Scenario) -> Floats | None:
     """U (n, n) with U ≥ B u_k u_k' B' for the control of every step; None where no bound is known.
 
-    For one channel it is tight; for several, u u' ≤ ‖u‖² I is used.
+    For one channel it is tight; for several, u u' ≤ ‖u‖² I is used. With an actuator that holds, ¼U ≥ Var(B a) for
+    every law of an a among 0, u_0, u_1, …: channel i has a range of width d_i, so that Var(a) ≤ ¼ Σ d_i² I (Popoviciu).
     """
     source, q = scenario.input, scenario.system.q
     if isinstance(source, FeedbackInput):
@@ -84,6 +85,9 @@ def control_bound(scenario: Scenario) -> Floats | None:
     if isinstance(source, ConstantInput):
         push = b @ np.array(source.value)
         return np.outer(push, push)
+    if scenario.actuator.on_loss == "hold":
+        width = _range(scenario)
+        return np.asarray(float(width @ width) * (b @ b.T))
     if isinstance(source, UniformInput):
         largest = np.maximum(np.abs(_channels(source.low, q)), np.abs(_channels(source.high, q)))
         peak = float(largest @ largest)
@@ -91,6 +95,17 @@ def control_bound(scenario: Scenario) -> Floats | None:
         u = deterministic(scenario)(np.arange(scenario.steps))
         peak = float(np.max(np.sum(u * u, axis=1)))
     return np.asarray(peak * (b @ b.T))
+
+
+def _range(scenario: Scenario) -> Floats:
+    """The width, by channel, of the range that holds zero and the control of every step; that is not fed back."""
+    source, q = scenario.input, scenario.system.q
+    if isinstance(source, UniformInput):
+        low, high = _channels(source.low, q), _channels(source.high, q)
+    else:
+        u = deterministic(scenario)(np.arange(scenario.steps))
+        low, high = u.min(axis=0), u.max(axis=0)
+    return np.asarray(np.maximum(high, 0.0) - np.minimum(low, 0.0))
 
 
 def _channels(value: float | tuple[float, ...], q: int) -> Floats:

@@ -3,6 +3,7 @@
 A scenario is read once, by `load_scenario` or `parse_scenario`; what comes out is complete, checked and immutable.
 """
 
+from testbed.scenario.actuator import Actuator, OnLoss
 from testbed.scenario.durations import format_duration, parse_duration
 from testbed.scenario.estimators import EstimatorSpec
 from testbed.scenario.inputs import (
@@ -35,6 +36,7 @@ from testbed.scenario.write import to_dict, to_toml
 
 __all__ = [
     "AckLink",
+    "Actuator",
     "BernoulliLoss",
     "Clock",
     "ConstantInput",
@@ -51,6 +53,7 @@ __all__ = [
     "MarkovLoss",
     "NoLoss",
     "ObservationLink",
+    "OnLoss",
     "Scenario",
     "ScriptedLoss",
     "SineInput",

@@ -22,8 +22,6 @@ class Part(BaseModel):
 
     other_keys: ClassVar[tuple[str, ...]] = ()
     """Keys allowed in the file that are resolved into fields, such as `mean_burst`."""
-    later_keys: ClassVar[tuple[str, ...]] = ()
-    """Keys that belong to later versions."""
 
     @classmethod
     def known_keys(cls) -> list[str]:

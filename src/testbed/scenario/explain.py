@@ -31,13 +31,15 @@ class Place:
     target: Target
 
 
-def explain(error: ValidationError) -> str:
+def explain(error: ValidationError, whole: type[Part] = Scenario) -> str:
     """One line for all the problems of `error`: the first of them, and how many more there are.
 
     Unknown keys come first, and hide what is missing beside them: most often it is the same key, misspelt.
     """
     details = [
-        (entry, locate(entry["loc"])) for entry in error.errors() if entry["type"] != "default_factory_not_called"
+        (entry, locate(entry["loc"], whole))
+        for entry in error.errors()
+        if entry["type"] != "default_factory_not_called"
     ]
     unknown = [(entry, place) for entry, place in details if _is_unknown(entry, place)]
     hidden = {place.parent for _, place in unknown}
@@ -55,9 +57,9 @@ def _is_unknown(entry: ErrorDetails, place: Place) -> bool:
     return entry["type"] == "extra_forbidden" and not (place.part and place.key in place.part.other_keys)
 
 
-def locate(loc: tuple[int | str, ...]) -> Place:
+def locate(loc: tuple[int | str, ...], whole: type[Part] = Scenario) -> Place:
     """The place of an error, from its location as the models report it (which has the kinds of unions in it)."""
-    target: Target = Scenario
+    target: Target = whole
     path, parent, key = "", "", ""
     part: type[Part] | None = None
     field: FieldInfo | None = None
@@ -91,8 +93,6 @@ def _target(annotation: Any) -> Target:
 def _unknown_key(place: Place) -> str:
     where = f"{place.parent}: " if place.parent else ""
     part = place.part or Scenario
-    if place.key in part.later_keys:
-        return f"{where}key {place.key!r} is not supported by this version"
     hint = did_you_mean(place.key, part.known_keys())
     return f"{where}unknown key {place.key!r}{hint or '; allowed: ' + ', '.join(part.known_keys())}"
 

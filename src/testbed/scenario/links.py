@@ -8,7 +8,7 @@ from pydantic_core import PydanticCustomError
 from testbed.scenario.base import Part, problem, shown
 from testbed.scenario.durations import Duration, parse_duration
 from testbed.scenario.impairments import Corrupt, Delay, Duplicate, Rate, Reorder
-from testbed.scenario.loss_laws import NoLoss
+from testbed.scenario.loss_laws import LossLaw, NoLoss
 from testbed.scenario.losses import Loss
 from testbed.scenario.replays import ScriptedLoss, TraceLoss
 
@@ -46,7 +46,7 @@ class SteppedImpairments(Impairments):
         description="Time after sending within which a packet counts for its step, at most the period; left out: the "
         "period. A later observation or ACK counts as late, a later control packet as lost.",
     )
-    assumed: Loss | None = Field(
+    assumed: LossLaw | None = Field(
         default=None,
         description="What estimators take the losses for, lateness counted as loss; left out: what follows from the "
         "other keys, or where there is no formula for it, a Markov chain fitted to a sample of the link.",

@@ -1,15 +1,19 @@
 """The scenario as a whole."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from testbed.errors import did_you_mean
+from testbed.errors import UsageError, did_you_mean
+from testbed.scenario.actuator import Actuator
 from testbed.scenario.base import Count, Part, count, problem, shown, size
+from testbed.scenario.changes import in_turn
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.estimators import EstimatorSpec
+from testbed.scenario.events import LinkEvent
 from testbed.scenario.inputs import ConstantInput, FeedbackInput, Input, TableInput, check_channels
-from testbed.scenario.links import Links
+from testbed.scenario.links import Links, SteppedImpairments
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Transport
 from testbed.scenario.uncertainty import Uncertainty
@@ -25,8 +29,6 @@ def _no_input(data: dict[str, Any]) -> ConstantInput | None:
 
 class Scenario(Part):
     """Everything that determines a run: the same scenario and seed give the same results."""
-
-    later_keys: ClassVar[tuple[str, ...]] = ("events",)
 
     name: str = Field(
         default="scenario",
@@ -46,9 +48,13 @@ class Scenario(Part):
     estimators: Annotated[tuple[EstimatorSpec, ...], Field(strict=False)] = Field(
         default=(), description="The estimators, all on the same packets."
     )
+    actuator: Actuator = Field(default_factory=Actuator, description="What the plant applies where u is lost.")
     input: Input | None = Field(default_factory=_no_input, description="The input u; default zero. Only with system.B.")
     links: Links = Field(default_factory=Links, description="The links between the parts.")
     transport: Transport = Field(default_factory=Transport, description="How the processes of a run talk.")
+    events: Annotated[tuple[LinkEvent, ...], Field(strict=False)] = Field(
+        default=(), description="The timeline: what changes while the run goes."
+    )
 
     @field_validator("uncertainty")
     @classmethod
@@ -87,6 +93,30 @@ class Scenario(Part):
             )
         return links.of_run(info.data["steps"]) if "steps" in info.data else links
 
+    @field_validator("events")
+    @classmethod
+    def _check_events(cls, events: tuple[LinkEvent, ...], info: ValidationInfo) -> tuple[LinkEvent, ...]:
+        if {"links", "clock", "steps"} <= info.data.keys():
+            for i in range(len(events)):
+                _check_event(info.data["links"], events, i, info.data["clock"], info.data["steps"])
+        return events
+
+    def changes_of(self, link: str) -> list[tuple[int, dict[str, Any]]]:
+        """(step, keys with their new values) of a link's events, in the order of time."""
+        return [(e.step(self.clock.period_ns), e.set) for e in _in_time(self.events, link, self.clock)]
+
+    def variants(self, link: str) -> list[SteppedImpairments]:
+        """The link of that name at the beginning, and after each of its events."""
+        return in_turn(getattr(self.links, link), [change for _, change in self.changes_of(link)])
+
+    @field_validator("actuator")
+    @classmethod
+    def _check_actuator(cls, actuator: Actuator, info: ValidationInfo) -> Actuator:
+        system: System | None = info.data.get("system")
+        if actuator.on_loss == "hold" and system is not None and system.B is None:
+            raise problem("got 'hold', but system.B is not given; allowed: zero, or hold with system.B", "on_loss")
+        return actuator
+
     @field_validator("input")
     @classmethod
     def _check_input(cls, source: Input | None, info: ValidationInfo) -> Input | None:
@@ -106,6 +136,26 @@ class Scenario(Part):
         if isinstance(source, FeedbackInput):
             return _closed_loop(source, system, info)
         return source
+
+
+def _check_event(links: Links, events: Sequence[LinkEvent], i: int, clock: Clock, steps: int) -> None:
+    """A problem of validation where an event does not fit the link as those before it have left it."""
+    event = events[i]
+    if event.step(clock.period_ns) > steps:
+        raise problem(f"got {shown(event.at)}; allowed: at most {steps}, the steps of the scenario", f"[{i}].at")
+    if event.link == "ack" and links.ack.mode != "link":
+        raise problem(f"got 'ack' with mode {links.ack.mode!r}; allowed: only with mode 'link'", f"[{i}].link")
+    ordered = _in_time(events, event.link, clock)
+    until_now = ordered[: next(n for n, other in enumerate(ordered) if other is event) + 1]
+    try:
+        in_turn(getattr(links, event.link), [e.set for e in until_now])
+    except UsageError as error:
+        raise problem(str(error), f"[{i}].set") from None
+
+
+def _in_time(events: Sequence[LinkEvent], link: str, clock: Clock) -> list[LinkEvent]:
+    """The events of a link in the order of time; those of one step as they are written."""
+    return sorted((e for e in events if e.link == link), key=lambda e: e.step(clock.period_ns))
 
 
 def _closed_loop(source: FeedbackInput, system: System, info: ValidationInfo) -> FeedbackInput:

@@ -2,6 +2,7 @@
 
     x_{k+1} = A x_k + nu_k B u_k + G w_k,  w ~ N(0, Q);     y_k = C x_k + v_k,  v ~ N(0, R);     x_0 ~ N(x0_mean, P0)
 
+With an actuator that holds its last input, B a_k in place of nu_k B u_k, a_k = nu_k u_k + (1 - nu_k) a_{k-1}.
 Sizes: x has n entries, u has q, y has p, w has g.
 """
 

@@ -17,6 +17,9 @@ def to_dict(scenario: Scenario) -> dict[str, Any]:
     estimators = table.pop("estimators")
     if estimators:
         table["estimators"] = [_flat(spec) for spec in estimators]
+    events = table.pop("events")
+    if events:
+        table["events"] = events
     result: dict[str, Any] = table
     return result
 

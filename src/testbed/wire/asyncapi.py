@@ -17,6 +17,7 @@ def asyncapi() -> dict[str, Any]:
     channels: dict[str, tuple[str, str, str]] = {
         "clock": (keys.clock, "clock", "orchestrator → controller: how far time may go"),
         "command": (keys.command, "command", "orchestrator → all roles"),
+        "change": (keys.change("{link}"), "change", "orchestrator → link: other values for keys of its table"),  # type: ignore[arg-type]
         "controlSent": (keys.sent("control"), "control", "controller → link, and estimators, which know u as sent"),
         "controlDelivered": (keys.delivered("control"), "control", "link → plant"),
         "observationSent": (keys.sent("observation"), "observation", "plant → link"),

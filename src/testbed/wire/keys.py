@@ -48,6 +48,15 @@ class Keys:
         """Where the recorded lanes of what goes over ``key`` are copied to."""
         return f"{self.prefix}/tap/{key[len(self.prefix) + 1 :]}"
 
+    def change(self, link: LinkName) -> str:
+        """Where the orchestrator tells a link of a change."""
+        return f"{self.prefix}/{link}/change"
+
+    @property
+    def ask(self) -> str:
+        """Ask here for something to be done while the run goes."""
+        return f"{self.prefix}/ask"
+
     def estimate(self, name: str) -> str:
         return f"{self.prefix}/estimate/{name}"
 

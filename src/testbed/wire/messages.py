@@ -155,7 +155,7 @@ class BoundsMessage(Packet):
     type: Literal["bounds"] = "bounds"
     ARRAYS: ClassVar[dict[str, ArrayRule]] = {
         "trace_lower": _floats("lanes", text="tr Pᴬ_k"),
-        "trace_upper": _floats("lanes", text="tr S_k; absent for an input without a bound", required=False),
+        "trace_upper": _floats("lanes", text="tr S_k; absent where no bound is known", required=False),
         "trace_upper_correlated": _floats(
             "lanes", text="tr S_k with room for correlated control losses; only under such", required=False
         ),
@@ -174,6 +174,14 @@ class Command(Message):
 
     type: Literal["command"] = "command"
     action: Literal["stop"]
+
+
+class Change(Message):
+    """An order to one link: from step ``step`` on, some keys of its table have other values."""
+
+    type: Literal["change"] = "change"
+    step: Count
+    set: Annotated[dict[str, Any], Field(description="keys of the link's table as in a scenario; 'none' removes one")]
 
 
 class Status(Message):
@@ -195,6 +203,7 @@ MESSAGES: dict[str, type[Message]] = {
     "bounds": BoundsMessage,
     "clock": ClockMessage,
     "command": Command,
+    "change": Change,
     "status": Status,
 }
 

@@ -82,7 +82,8 @@ class FourStates:
 class System:
     """x⁺ = A x + ν B u + w, y = C x + v; ν a chain with P(0→1) = recovery, P(1→0) = failure, P(ν_0 = 1) = start.
 
-    With a ``channel``, ν is that of it instead.
+    With a ``channel``, ν is that of it instead. With ``hold``, what is applied in place of a lost u is the last one
+    that arrived, and zero before the first.
     """
 
     A: Floats
@@ -96,6 +97,7 @@ class System:
     failure: float
     start: float
     channel: Channel | FourStates | None = None
+    hold: bool = False
 
     @property
     def n(self) -> int:
@@ -115,6 +117,18 @@ class System:
         if last is None:
             return self.start
         return 1.0 - self.failure if last else self.recovery
+
+    def applied(self, u: Floats, histories: Floats) -> Floats:
+        """What is applied at each step: u (k, q), histories (N, k) → (N, k, q)."""
+        if not self.hold:
+            return histories[:, :, None] * u
+        out = np.zeros((*histories.shape, u.shape[1]))
+        for i, history in enumerate(histories):
+            for j in range(len(u)):
+                newest = [m for m in range(j + 1) if history[m] == 1]
+                if newest:
+                    out[i, j] = u[newest[-1]]
+        return out
 
     def prior(self, history: tuple[int, ...]) -> float:
         """P(ν_0 … ν_{k−1} = history); with a channel the sum over all paths of its state."""
@@ -312,9 +326,10 @@ def random_trial(
         arrived = rng.random((steps, lanes)) < rng.uniform(0.3, 0.9)
     x = rng.multivariate_normal(system.x0_mean, system.P0, size=lanes, method="eigh")
     y = np.zeros((steps, lanes, system.p))
+    applied = np.stack([system.applied(u[:, i], nu[None, :, i])[0] for i in range(lanes)], axis=1)
     for k in range(steps):
         w = rng.multivariate_normal(np.zeros(system.n), system.Q, size=lanes, method="eigh")
-        x = x @ system.A.T + nu[k][:, None] * (u[k] @ system.B.T) + w
+        x = x @ system.A.T + applied[k] @ system.B.T + w
         y[k] = x @ system.C.T + rng.multivariate_normal(np.zeros(system.p), system.R, size=lanes)
     y[~arrived] = 0.0
     return Trial(system, u, y, arrived, nu, _ack_steps(rng, acks, steps, lanes))

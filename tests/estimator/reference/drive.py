@@ -36,6 +36,7 @@ def model_of(system: System) -> Model:
         x0_mean=system.x0_mean,
         P0=system.P0,
         control=losses_of(system),
+        on_loss="hold" if system.hold else "zero",
     )
 
 

@@ -17,10 +17,11 @@ def ff(system: System, u: Floats, y: Floats, arrived: Bools, known: dict[int, in
     u (k, q), y (k, p), arrived (k,); known: {j: ν_j} of the packets known in time.
     """
     n, p, k = system.n, system.p, len(u)
-    rate = system.recovery
+    histories, priors = weighted_histories(system, k, known)
+    applied = np.tensordot(priors, system.applied(u, histories), axes=1)
     offset, weights = system.x0_mean, np.zeros((n, k * p))
     for j in range(1, k + 1):
-        offset = system.A @ offset + known.get(j - 1, rate) * system.B @ u[j - 1]
+        offset = system.A @ offset + system.B @ applied[j - 1]
         weights = system.A @ weights
         if arrived[j - 1]:
             gain = Stack(system, arrived[:j]).gain[:, -p:]
@@ -28,7 +29,6 @@ def ff(system: System, u: Floats, y: Floats, arrived: Bools, known: dict[int, in
             weights = weights - gain @ system.C @ weights
             weights[:, (j - 1) * p : j * p] += gain
     stack = Stack(system, np.ones(k, dtype=bool))
-    histories, priors = weighted_histories(system, k, known)
     from_noise = stack.X - weights @ stack.H
     from_losses = stack.state_means(u, histories, k) - offset - stack.output_means(u, histories) @ weights.T
     cov = from_noise @ stack.noise_cov @ from_noise.T + (from_losses * priors[:, None]).T @ from_losses

@@ -2,7 +2,9 @@
 
 With ξ = (x_0 - x̄_0, w_0, …, w_{k-1}, v_1, …, v_k) and a history h of control losses,
 
-    x_j = A^j x̄_0 + Σ_{i<j} h_i A^{j-1-i} B u_i + X_j ξ,     y_j = C x_j + v_j = … + Y_j ξ,     cov ξ block diagonal.
+    x_j = A^j x̄_0 + Σ_{i<j} A^{j-1-i} B a_i(h) + X_j ξ,     y_j = C x_j + v_j = … + Y_j ξ,     cov ξ block diagonal,
+
+and a_i(h) = h_i u_i, or what the actuator holds.
 """
 
 from __future__ import annotations
@@ -50,8 +52,11 @@ class Stack:
     def state_means(self, u: Floats, histories: Floats, j: int) -> Floats:
         """Mean of x_j for each history: u (k, q), histories (N, k) → (N, n)."""
         A, B = self.system.A, self.system.B
-        pushes = np.array([matrix_power(A, j - 1 - i) @ B @ u[i] for i in range(j)]).reshape(j, self.system.n)
-        return np.asarray(matrix_power(A, j) @ self.system.x0_mean + histories[:, :j] @ pushes, dtype=np.float64)
+        means = np.tile(matrix_power(A, j) @ self.system.x0_mean, (len(histories), 1))
+        applied = self.system.applied(u[:j], histories[:, :j])
+        for i in range(j):
+            means += applied[:, i] @ (matrix_power(A, j - 1 - i) @ B).T
+        return means
 
     def output_means(self, u: Floats, histories: Floats) -> Floats:
         """Means of the received y, stacked: (N, p · number received)."""

@@ -26,18 +26,22 @@ class Expected:
     mean_burst_deviation: float | None
 
 
+_TIME = {"slot", "rate", "delay", "reorder", "duplicate", "corrupt"}
 _LOSS: TypeAdapter[Loss] = TypeAdapter(Loss)
 
 
 def expected_links(summary: Summary, scenario_toml: str) -> dict[str, Expected]:
-    """What is expected of each link that sent a packet and whose losses are drawn by a law.
+    """What is expected of each link that sent a packet, whose losses are drawn by one law, and that takes no time.
 
     Raises:
         tomllib.TOMLDecodeError: the scenario is not TOML.
     """
     tables = tomllib.loads(scenario_toml).get("links", {})
+    eventful = {event.link for event in summary.events}
     expected = {}
     for name, figures in summary.links.items():
+        if name in eventful or _TIME & set(tables.get(name, {})):
+            continue
         try:
             loss = _LOSS.validate_python(tables.get(name, {}).get("loss", {"kind": "none"}))
         except ValidationError:
