@@ -163,6 +163,14 @@ def test_a_full_bucket_leaves_at_once_and_is_full_again_after_a_pause() -> None:
         assert left(rate, arrivals) == expected + [pause + 200_000 + at for at in again]
 
 
+def test_the_slowest_line_and_the_deepest_bucket_are_exact() -> None:
+    assert left(Rate(bits_per_second=2.0**-60), [(0, 1)]) == [8 * 2**60 * 10**9]
+    rate = Rate(bits_per_second=3e15 / 7, burst_bytes=2**40)
+    exact = simulated(rate, [(0, 2**40), (1, 1)])[1]
+    assert exact is not None
+    assert left(rate, [(0, 2**40), (1, 1)]) == [0, ceil(exact)]
+
+
 def test_in_the_long_run_it_is_the_rate() -> None:
     rate = Rate(bits_per_second=1e6, burst_bytes=3000, queue_packets=10)
     packets = flow(rate, [(i * 100_000, 125) for i in range(50_000)])
