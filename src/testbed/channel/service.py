@@ -14,7 +14,7 @@ from testbed.channel.loss import LossCounts
 from testbed.channel.packets import packet_bytes
 from testbed.channel.processes import FateProcess, goes_on, process_of
 from testbed.channel.steps import SteppedLink
-from testbed.channel.timed import TimedBlock
+from testbed.channel.timed import TimedBlock, room
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
 from testbed.scenario import AckLink, Link, Loss, NoLoss, Scenario
@@ -78,7 +78,8 @@ def timed_block(scenario: Scenario, link: LinkName, lane: int, lanes: int, size:
     stepped = SteppedLink(carriers, size, period_ns, settings.deadline_ns(period_ns))
     model, _, name = _TYPES[link]
     batch = settings.batch if isinstance(settings, AckLink) else 1
-    return TimedBlock(stepped, lanes, name, first_step=model.FIRST_STEP, batch=batch)
+    keep = room(scenario.lanes, 8 * max(scenario.system.p, scenario.system.q), batch)
+    return TimedBlock(stepped, lanes, name, first_step=model.FIRST_STEP, keep=keep, batch=batch)
 
 
 def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]:
