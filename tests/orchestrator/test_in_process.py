@@ -404,7 +404,7 @@ def test_everybody_hears_what_is_theirs(tmp_path: Path) -> None:
     assert by_name["plant"] == {"control/delivered"}
     assert by_name["bounds"] == {"observation/delivered"}
     for link in ("control", "observation", "ack"):
-        assert by_name[link] == {f"{link}/sent"}
+        assert by_name[link] == {f"{link}/sent", f"{link}/change"}
     blind = {"control/sent", "observation/delivered"}
     assert by_name["aoe"] == by_name["ff"] == by_name["oe"] == blind
     assert by_name["aoe-acks"] == by_name["oe-acks"] == blind | {"ack/delivered"}
