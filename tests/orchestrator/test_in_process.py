@@ -417,7 +417,7 @@ def test_every_key_of_a_run_is_documented(tmp_path: Path) -> None:
     keys = {key for key, _ in Watched.current.published}
     assert all(sum(matches(pattern, key) for pattern in patterns) == 1 for key in keys)
     unused = [pattern for pattern in patterns if not any(matches(pattern, key) for key in keys)]
-    assert all(pattern.endswith("/change") for pattern in unused), "a link is told of a change only where one is ordered"
+    assert all(pattern.endswith("/change") for pattern in unused), "only where one is ordered"
 
 
 def test_progress_is_told_step_by_step(tmp_path: Path) -> None:
