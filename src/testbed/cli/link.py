@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from testbed.cli import link_relay
+from testbed.cli import link_doctor, link_hosts, link_relay
 from testbed.cli.link_names import link_name
 from testbed.errors import UsageError
 
@@ -117,3 +117,6 @@ def _shown(value: float | None) -> str:
 
 
 app.command("relay")(link_relay.relay)
+app.command("hosts")(link_hosts.hosts)
+app.command("doctor")(link_doctor.doctor)
+app.command("clean")(link_doctor.clean)
