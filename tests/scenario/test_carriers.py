@@ -7,22 +7,20 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from testbed.channel.carriers import carrier_of
-from testbed.channel.pipeline import Pipeline
+from testbed.channel.carriers import carriers_of
 from testbed.channel.tcp import TcpCarrier
 from testbed.channel.udp import UdpCarrier
 from testbed.scenario.carriers import LinkTransport, TcpTransport, UdpTransport
-from testbed.scenario.links import Impairments
+from testbed.scenario.links import Link
 
 ADAPTER: TypeAdapter[UdpTransport | TcpTransport] = TypeAdapter(LinkTransport)
 
 
 def test_the_kind_chooses_the_part_and_the_carrier() -> None:
-    pipelines = [Pipeline(Impairments(), 1, name) for name in ("forward", "backward")]
     for kind, part, carrier in (("udp", UdpTransport, UdpCarrier), ("tcp", TcpTransport, TcpCarrier)):
         settings = ADAPTER.validate_python({"kind": kind})
         assert settings == part()
-        assert type(carrier_of(settings, *pipelines)) is carrier
+        assert type(carriers_of(Link(transport=settings), 1, "link.test", 0, 1)[0]) is carrier
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from testbed.channel.tcp.segment import Ack, Data
 from testbed.channel.tcp.sender import Sender
 from testbed.scenario.carriers import TcpTransport
 from testbed.scenario.durations import parse_duration
-from testbed.scenario.links import Impairments
+from testbed.scenario.links import Impairments, SteppedImpairments
 
 HEADER_BYTES: Final = 52
 """Of IP and TCP, with the time stamps."""
@@ -87,9 +87,11 @@ class TcpCarrier:
         return min(times, default=None)
 
     def change(self, settings: Impairments) -> None:
-        """Other impairments from now on, in both directions; for one of them, change its pipeline."""
-        for pipeline in self._pipelines[:2]:
-            pipeline.change(settings)
+        """Other impairments from now on; backwards too, unless the link says what happens there."""
+        forward, backward = self._pipelines[:2]
+        forward.change(settings)
+        if not isinstance(settings, SteppedImpairments) or settings.back is None:
+            backward.change(settings)
 
     def as_counters(self) -> dict[str, int]:
         """What the connections did so far."""
