@@ -29,8 +29,8 @@ def law_in_steps(link: SteppedImpairments, period_ns: int) -> LossModel:
     """The losses of a link as they are seen from step to step, a packet a period.
 
     ``assumed`` where it is given. Otherwise exact, but for a clock whose slots do not divide the period (there, the
-    mean over their phases), where packets do not depend on each other but through the chain; with a bottleneck or with
-    delays in order, the Markov chain that fits the counts of a sample of 20,000 packets.
+    mean over their phases), where packets do not depend on each other but through the chain; with a bottleneck,
+    with delays in order or with a transport, the Markov chain that fits the counts of a sample of 20,000 packets.
     """
     if link.assumed is not None:
         return chain_of(link.assumed)
@@ -45,8 +45,13 @@ def law_in_steps(link: SteppedImpairments, period_ns: int) -> LossModel:
 
 def has_formula(link: SteppedImpairments) -> bool:
     """Whether the fates of packets depend on each other through the chain of the losses alone."""
-    delay = link.delay
-    return link.rate is None and (delay is None or isinstance(delay, ConstantDelay) or not delay.in_order)
+    if link.rate is not None or link.transport is not None:
+        return False
+    return link.delay is None or isinstance(link.delay, ConstantDelay) or not link.delay.in_order
+        link.rate is None
+        and link.transport is None
+        and (delay is None or isinstance(delay, ConstantDelay) or not delay.in_order)
+    )
 
 
 def _exact(link: SteppedImpairments, period_ns: int) -> LossModel:

@@ -75,9 +75,11 @@ def _notes(summary: Summary) -> list[RenderableType]:
 
 
 def _links(summary: Summary) -> Table:
-    table = _table("link", "sent", "dropped", "loss rate")
+    late = any(link.late for link in summary.links.values())
+    table = _table("link", "sent", "dropped", *(["late"] if late else []), "loss rate")
     for name, link in summary.links.items():
-        cells = [name, text.count(link.sent), text.count(link.dropped), text.number(link.loss_rate)]
+        counts = [link.sent, link.dropped, *([link.late] if late else [])]
+        cells = [name, *map(text.count, counts), text.number(link.loss_rate)]
         table.add_row(*(Text(cell) for cell in cells))
     return table
 

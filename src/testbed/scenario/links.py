@@ -6,6 +6,7 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from testbed.scenario.base import Part, problem, shown
+from testbed.scenario.carriers import LinkTransport, TcpTransport
 from testbed.scenario.durations import Duration, parse_duration
 from testbed.scenario.impairments import Corrupt, Delay, Duplicate, Rate, Reorder
 from testbed.scenario.loss_laws import LossLaw, NoLoss
@@ -52,10 +53,27 @@ class SteppedImpairments(Impairments):
         "other keys, or where there is no formula for it, a Markov chain fitted to a sample of the link.",
     )
 
+    transport: LinkTransport | None = Field(
+        default=None,
+        description="What carries the messages: datagrams, or a connection that retransmits; left out: a packet a "
+        "message, with nothing around it.",
+    )
+    back: Impairments | None = Field(
+        default=None,
+        description="What happens to what a connection sends back (acknowledgements, answers); only with transport "
+        "'tcp'; left out: the same as forwards.",
+    )
+
+    @model_validator(mode="after")
+    def _back_with_tcp(self) -> "SteppedImpairments":
+        if self.back is not None and not isinstance(self.transport, TcpTransport):
+            raise problem("got a table without transport 'tcp'; allowed: only with it", "back")
+        return self
+
     @property
     def takes_time(self) -> bool:
         """Whether a packet may arrive late, twice or spoilt, or meet a chain that is not moved by packets."""
-        stages = (self.slot, self.rate, self.delay, self.reorder, self.duplicate, self.corrupt)
+        stages = (self.slot, self.rate, self.delay, self.reorder, self.duplicate, self.corrupt, self.transport)
         return any(stage is not None for stage in stages)
 
     def deadline_ns(self, period_ns: int) -> int:

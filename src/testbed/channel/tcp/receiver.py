@@ -1,0 +1,99 @@
+"""The receiving end: puts the stream in order and acknowledges it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from testbed.channel.tcp.segment import Ack, Data
+
+BLOCKS_MAX = 3  # of a SACK option beside a time stamp
+_QUICK = 16  # acknowledgements that are not delayed when a connection is new, or a segment came twice
+
+
+class Receiver:
+    """acknowledge: called with each `Ack` and the time.
+
+    A segment out of order, one that came before and one that fills a gap are acknowledged at once (RFC 5681, 4.2).
+    Others, with ``delay_ns`` = 0, too: Linux does that when the application reads each small segment at once and sends
+    nothing back. Else every second one is, or what is there when ``delay_ns`` is over.
+    """
+
+    def __init__(self, delay_ns: int, acknowledge: Callable[[Ack, int], None]) -> None:
+        self.expected = 0
+        self.deadline_ns: int | None = None
+        self._delay_ns, self._send = delay_ns, acknowledge
+        self._ranges: list[tuple[int, int]] = []  # beyond `expected`, the one that changed last first
+        self._told = 0
+        self._stamp = 0
+        self._waiting = 0
+        self._quick = _QUICK
+
+    def segment(self, data: Data, now_ns: int) -> bool:
+        """Take in a segment; True if more of the stream is in order now."""
+        start, end, stamp = data
+        expected = self.expected
+        if start <= self._told and stamp > self._stamp:
+            self._stamp = stamp
+        duplicate: tuple[int, int] | None = None
+        if start > expected:
+            self._acknowledge(now_ns, self._insert(start, end))
+            return False
+        if end <= expected:
+            self._quick = _QUICK
+            self._acknowledge(now_ns, (start, end))
+            return False
+        if start < expected:
+            duplicate = (start, expected)
+        self.expected = end
+        gap = bool(self._ranges)
+        if gap:
+            duplicate = self._join() or duplicate
+        if gap or duplicate is not None or not self._delay_ns:
+            self._acknowledge(now_ns, duplicate)
+        else:
+            self._delay(now_ns)
+        return True
+
+    def timeout(self, now_ns: int) -> None:
+        """The delay of an acknowledgement is over."""
+        self._acknowledge(now_ns, None)
+
+    def _delay(self, now_ns: int) -> None:
+        self._waiting += 1
+        if self._quick > 0 or self._waiting >= 2:
+            self._quick -= 1
+            self._acknowledge(now_ns, None)
+        else:
+            self.deadline_ns = now_ns + self._delay_ns
+
+    def _acknowledge(self, now_ns: int, duplicate: tuple[int, int] | None) -> None:
+        self._told = self.expected
+        self._waiting, self.deadline_ns = 0, None
+        blocks = self._ranges[: BLOCKS_MAX - (duplicate is not None)] if self._ranges else ()
+        self._send(Ack(self.expected, self._stamp, tuple(blocks), duplicate), now_ns)
+
+    def _insert(self, start: int, end: int) -> tuple[int, int] | None:
+        """Keep a range beyond a gap; returns what of it had come before."""
+        duplicate: tuple[int, int] | None = None
+        kept = []
+        for low, high in self._ranges:
+            if high < start or low > end:
+                kept.append((low, high))
+                continue
+            if max(low, start) < min(high, end):
+                duplicate = (max(low, start), min(high, end))
+            start, end = min(low, start), max(high, end)
+        self._ranges = [(start, end), *kept]
+        return duplicate
+
+    def _join(self) -> tuple[int, int] | None:
+        """Ranges that the stream in order has reached become part of it; returns what of the first came twice."""
+        duplicate: tuple[int, int] | None = None
+        for low, high in sorted(self._ranges):
+            if low > self.expected:
+                break
+            if low < self.expected and duplicate is None:
+                duplicate = (low, min(high, self.expected))
+            self.expected = max(self.expected, high)
+        self._ranges = [block for block in self._ranges if block[0] > self.expected]
+        return duplicate
