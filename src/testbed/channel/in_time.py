@@ -48,10 +48,6 @@ def has_formula(link: SteppedImpairments) -> bool:
     if link.rate is not None or link.transport is not None:
         return False
     return link.delay is None or isinstance(link.delay, ConstantDelay) or not link.delay.in_order
-        link.rate is None
-        and link.transport is None
-        and (delay is None or isinstance(delay, ConstantDelay) or not delay.in_order)
-    )
 
 
 def _exact(link: SteppedImpairments, period_ns: int) -> LossModel:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from functools import partial
 from typing import Any
 
@@ -12,8 +11,9 @@ from numpy.typing import NDArray
 from testbed.channel.carriers import carriers_of
 from testbed.channel.loss import LossCounts
 from testbed.channel.processes import FateProcess, goes_on, process_of
+from testbed.channel.real.service import RealLinkService
 from testbed.channel.steps import SteppedLink
-from testbed.channel.timed import TimedBlock
+from testbed.channel.timed import TimedBlock, timed_counters
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
 from testbed.scenario import AckLink, Link, Loss, NoLoss, Scenario
@@ -41,7 +41,14 @@ def role_of(link: LinkName) -> str:
 
 def builder(link: LinkName) -> Any:
     """What builds the service of one link."""
-    return partial(LinkService, link=link)
+
+    def build(node: Node, setup: Setup) -> LinkService | RealLinkService:
+        if getattr(setup.scenario.links, link).is_real:
+            model, sender, name = _TYPES[link]
+            return RealLinkService(node, setup, link=link, model=model, sender=sender, name=name)
+        return LinkService(node, setup, link=link)
+
+    return build
 
 
 def loss_of(scenario: Scenario, link: LinkName) -> Loss:
@@ -79,21 +86,6 @@ def timed_block(scenario: Scenario, link: LinkName, lane: int, lanes: int, size:
     model, _, name = _TYPES[link]
     batch = settings.batch if isinstance(settings, AckLink) else 1
     return TimedBlock(stepped, lanes, name, first_step=model.FIRST_STEP, batch=batch)
-
-
-def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]:
-    """The counters of a link that takes time; nothing where there is no block."""
-    total: Counter[str] = Counter()
-    for block in blocks:
-        books = block.books
-        total["late"] += block.late
-        if not keeps_late:
-            books.delivered -= block.late
-            books.dropped["late"] += block.late
-        counts = block.counts.as_counters()
-        total.update({key: counts[key] for key in ("bursts", "00", "01", "10", "11")})
-        total.update(books.as_counters())
-    return dict(total)
 
 
 def packet_bytes(scenario: Scenario, link: LinkName) -> int:

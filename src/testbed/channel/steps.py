@@ -7,6 +7,7 @@ that, and late otherwise: then it belongs to the first later packet before whose
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -25,6 +26,23 @@ class Arrivals:
 
     in_time: Bools
     late: list[tuple[int, Bools]]
+
+
+class StepLink(Protocol):
+    """A link for a block of lanes, seen in steps."""
+
+    @property
+    def books(self) -> Books:
+        """Of all lanes together."""
+        ...
+
+    def send(self, number: int) -> Arrivals:
+        """Send packet ``number`` in every lane, and what has arrived by its deadline."""
+        ...
+
+    def change(self, settings: Impairments) -> None:
+        """Other impairments for the packets from now on."""
+        ...
 
 
 class SteppedLink:

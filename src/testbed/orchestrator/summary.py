@@ -119,6 +119,11 @@ class LinkFigures(_Model):
     in_flight: NonNegativeInt = 0
     corrupted: NonNegativeInt = Field(default=0, description="copies that arrived with a bit flipped")
     causes: dict[str, NonNegativeInt] = Field(default_factory=dict, description="those dropped, by cause")
+    real: dict[str, NonNegativeInt] = Field(
+        default_factory=dict,
+        description="of a link through real sockets: packets that left more than a period late (behind), and the books "
+        "of its packets, forward and backward",
+    )
     transitions: Transitions = Transitions()
     loss_rate: Number = None
     mean_burst: Number = Field(default=None, description="mean number of packets lost in a row")

@@ -35,6 +35,7 @@ class UdpRelay(SocketLink):
 
     The packets of a direction are numbered over all clients. Beyond ``clients_max`` clients a new one takes the place
     of the one that was silent longest, if that was ``idle_ns`` or longer; else its packets are refused and counted.
+    checksummed: a corrupted packet is dropped, as the UDP of its receiver would, instead of handed on.
 
     Raises UsageError where the address cannot be had.
     """
@@ -50,6 +51,7 @@ class UdpRelay(SocketLink):
         listen: tuple[str, int] = ("127.0.0.1", 0),
         clients_max: int = 64,
         idle_ns: int = 60_000_000_000,
+        checksummed: bool = False,
         traces: dict[Direction, Path] | None = None,
     ) -> None:
         self._family, self._target = Endpoint("udp", *target).resolve()
@@ -66,7 +68,9 @@ class UdpRelay(SocketLink):
         except BaseException:
             self._listener.close()
             raise
-        self._ways = {way: Way(self._pipelines[way], self._traces.get(way), _HELD_MAX) for way in DIRECTIONS}
+        self._ways = {
+            way: Way(self._pipelines[way], self._traces.get(way), _HELD_MAX, checksummed) for way in DIRECTIONS
+        }
         self._forward, self._backward = self._ways["forward"], self._ways["backward"]
         self._loop.watch(self._listener.fileno(), self._from_clients)
 
