@@ -1,8 +1,8 @@
 """One end of a link, a process with a zenoh session of its own; started by the role of the link, never by hand.
 
-``python -m testbed.channel.real.ends --listen ENDPOINT …``: what is published on the key goes to standard output; the
-first frame there is READY. With ``--connect ENDPOINT`` instead: what comes on standard input is published, each frame
-at once and on its own. Both leave when standard input closes.
+``python -m testbed.channel.real.ends --listen ENDPOINT …``: what is published on the key goes to standard output. With
+``--connect ENDPOINT`` instead: what comes on standard input is published, each frame at once and on its own. Both say
+READY on standard output first, and leave when standard input closes.
 """
 
 from __future__ import annotations
@@ -61,6 +61,7 @@ def _receive(bus: ZenohBus, key: str) -> None:
 
 def _send(bus: ZenohBus, key: str) -> None:
     publish = bus.publisher(key)
+    _write(framed(READY))
     for message in messages(sys.stdin.buffer):
         publish(message)
 

@@ -88,12 +88,9 @@ class Path:
     def _receiver(self) -> None:
         """Start the receiving end; on another port where that one was taken meanwhile."""
         for left in reversed(range(_ATTEMPTS)):
-            process = self._start(RECEIVER, ["--listen", self._middle.listen()])
-            threading.Thread(target=self._read, args=(process,), daemon=True).start()
+            self._start(RECEIVER, ["--listen", self._middle.listen()])
             try:
-                self._hear(_OPEN_S)
-            except TimeoutError:
-                raise RunFailed(f"its {RECEIVER} was not ready within {_OPEN_S:g} s") from None
+                self._ready(RECEIVER)
             except RunFailed:
                 if not left:
                     raise
@@ -102,7 +99,14 @@ class Path:
 
     def _sender(self) -> None:
         process = self._start(SENDER, ["--connect", self._middle.connect()])
+        self._ready(SENDER)
         threading.Thread(target=self._write, args=(process,), daemon=True).start()
+
+    def _ready(self, what: str) -> None:
+        try:
+            self._hear(_OPEN_S)
+        except TimeoutError:
+            raise RunFailed(f"its {what} was not ready within {_OPEN_S:g} s") from None
 
     def _probe(self) -> None:
         """Until the first message comes through."""
@@ -130,6 +134,7 @@ class Path:
         pipe = subprocess.PIPE
         process = self._middle.popen(what)(command, stdin=pipe, stdout=pipe, stderr=pipe, start_new_session=True)
         self._ends[what] = process
+        threading.Thread(target=self._read, args=(process,), daemon=True).start()
         threading.Thread(target=self._listen, args=(what, process), daemon=True).start()
         return process
 
