@@ -42,6 +42,10 @@ class Middle(Protocol):
         """What starts the RECEIVER or the SENDER."""
         ...
 
+    def opened(self) -> None:
+        """The ends hear each other: nobody else is let in."""
+        ...
+
     def change(self, settings: SteppedImpairments) -> None:
         """Other impairments from now on. Raises TestbedError."""
         ...
@@ -105,7 +109,6 @@ class RelayMiddle:
                 self._target,
                 seed=self._seed,
                 components=self._components,
-                clients_max=1,
                 idle_ns=_IDLE_NS,
                 checksummed=True,
             )
@@ -116,6 +119,11 @@ class RelayMiddle:
 
     def popen(self, end: str) -> Popen:
         return subprocess.Popen
+
+    def opened(self) -> None:
+        link = self._running()
+        if isinstance(link, UdpRelay):
+            link.limit_clients(1)
 
     def change(self, settings: SteppedImpairments) -> None:
         link = self._running()
@@ -163,6 +171,9 @@ class KernelMiddle:
 
     def popen(self, end: str) -> Popen:
         return (self._hosts.b if end == RECEIVER else self._hosts.a).popen
+
+    def opened(self) -> None:
+        """Nobody else is in the namespaces."""
 
     def change(self, settings: SteppedImpairments) -> None:
         for direction, impairments in zip(DIRECTIONS, directions(settings), strict=True):

@@ -21,7 +21,6 @@ from testbed.scenario.links import SteppedImpairments
 _MODULE = "testbed.channel.real.ends"
 _PROBE = b"probe"
 _PROBE_EVERY_S = 0.05
-_OPEN_S = 20.0
 _ATTEMPTS = 5
 _LEAVE_S = 0.3
 _WAITING_MAX = 65536
@@ -43,9 +42,14 @@ class Path:
         key: str,
         arrived: Callable[[bytes], None],
         failed: Callable[[TestbedError], None],
+        *,
+        patience_s: float,
     ) -> None:
+        """patience_s: for the path to open."""
         self._middle, self._settings, self._key = middle, settings, key
         self._arrived, self._failed = arrived, failed
+        self._patience_s = patience_s
+        self._deadline_s = 0.0
         self.refused = 0
         self._ends: dict[str, subprocess.Popen[bytes]] = {}
         self._words: dict[str, str] = {}
@@ -56,12 +60,14 @@ class Path:
         self._cleanup = ExitStack()
 
     def __enter__(self) -> Self:
+        self._deadline_s = time.monotonic() + self._patience_s
         with ExitStack() as cleanup:
             cleanup.enter_context(self._middle)
             cleanup.callback(self._end)
             self._receiver()
             self._sender()
             self._probe()
+            self._middle.opened()
             self._middle.change(self._settings)
             self._cleanup = cleanup.pop_all()
         return self
@@ -104,21 +110,20 @@ class Path:
 
     def _ready(self, what: str) -> None:
         try:
-            self._hear(_OPEN_S)
+            self._hear(max(0.0, self._deadline_s - time.monotonic()))
         except TimeoutError:
-            raise RunFailed(f"its {what} was not ready within {_OPEN_S:g} s") from None
+            raise RunFailed(f"its {what} was not ready within {self._patience_s:g} s") from None
 
     def _probe(self) -> None:
         """Until the first message comes through."""
-        deadline = time.monotonic() + _OPEN_S
-        while time.monotonic() < deadline:
+        while time.monotonic() < self._deadline_s:
             self._outbox.put(_PROBE)
             with suppress(TimeoutError):
                 self._hear(_PROBE_EVERY_S)
                 self._open = True
                 return
             self._check()
-        raise RunFailed(f"its two ends did not hear each other within {_OPEN_S:g} s")
+        raise RunFailed(f"its two ends did not hear each other within {self._patience_s:g} s")
 
     def _hear(self, patience_s: float) -> bytes:
         try:
@@ -140,7 +145,8 @@ class Path:
 
     def _limits(self) -> list[str]:
         transport = self._settings.transport
-        lease_ms, blocked_ms, open_ms, retry_ms = _UDP_LEASE_S * 1000, 5_000, 10_000, 1_000
+        lease_ms, blocked_ms, retry_ms = _UDP_LEASE_S * 1000, 5_000, 1_000
+        open_ms = max(1, int(self._patience_s * 1000))
         if isinstance(transport, TcpTransport):
             lease_ms, blocked_ms = _ms(transport.lease), _ms(transport.blocked_limit)
             open_ms, retry_ms = _ms(transport.open_limit), _ms(transport.retry)

@@ -28,6 +28,8 @@ from testbed.wire.messages import Change, Packet
 from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.setup import Setup
 
+_PATIENCE = 0.8
+"""Share of the run's deadline that the path may take to open, so that its own error comes first."""
 _CHECK_NS = 500_000_000
 _SWITCH_S = 0.0005
 """Threads of this process that handle packets take turns as often."""
@@ -85,7 +87,7 @@ class RealLinkService:
         middle = middle_of(settings, scenario.seed, node.name)
         key = f"{node.keys.prefix}/{link}/path"
         arrived, failed = (lambda m: call(partial(self._arrived, m))), (lambda e: call(partial(_fail, e)))
-        path = Path(middle, settings, key, arrived, failed)
+        path = Path(middle, settings, key, arrived, failed, patience_s=_PATIENCE * setup.transport.deadline_ns * 1e-9)
         self._path = node.leaving.enter_context(path)
         self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
         node.on(node.keys.sent(link), model, sender, self._take, needs=(name,))

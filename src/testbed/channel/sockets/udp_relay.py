@@ -74,6 +74,14 @@ class UdpRelay(SocketLink):
         self._forward, self._backward = self._ways["forward"], self._ways["backward"]
         self._loop.watch(self._listener.fileno(), self._from_clients)
 
+    def limit_clients(self, clients_max: int) -> None:
+        """Let so many in from now on; those that are in stay. From any thread."""
+
+        def limit() -> None:
+            self._clients_max = clients_max
+
+        self._loop.call(limit)
+
     def _from_clients(self, _: int) -> None:
         receive, clients, loop, way = self._listener.recvfrom, self._clients, self._loop, self._forward
         for _ in range(_BATCH):
