@@ -41,8 +41,12 @@ class Outcome:
 
     def loss_z(self, link: str) -> float:
         """Distance of the losses from their mean, in standard deviations of the binomial law."""
-        sent, arrival = self.links[link]["sent"], ARRIVAL[link]
-        return float((self.links[link]["dropped"] - sent * (1 - arrival)) / math.sqrt(sent * arrival * (1 - arrival)))
+        sent, lost, arrival = self.links[link]["sent"], self.lost(link), ARRIVAL[link]
+        return float((lost - sent * (1 - arrival)) / math.sqrt(sent * arrival * (1 - arrival)))
+
+    def lost(self, link: str) -> int:
+        """Packets that the link lost; not those that came late."""
+        return int(self.links[link]["causes"].get("loss", 0))
 
 
 def tables(*, lanes: int, steps: int, period: str, seed: int) -> dict[str, Any]:
@@ -101,8 +105,11 @@ def report(outcomes: dict[str, Outcome]) -> str:
             "–" if each is model else f"{share:.0%}" for each, share in zip(outcomes.values(), inside, strict=True)
         ]
         lines.append(f"| {name}: steps with abs z ≤ 1.96 | {' | '.join(cells)} |")
+        largest = [np.abs(z_steps(each, model, name)).max() for each in outcomes.values()]
+        cells = ["–" if each is model else f"{z:.2f}" for each, z in zip(outcomes.values(), largest, strict=True)]
+        lines.append(f"| {name}: largest abs z of a step | {' | '.join(cells)} |")
     for link in ARRIVAL:
-        cells = [f"{e.links[link]['dropped']} ({e.loss_z(link):+.2f})" for e in outcomes.values()]
+        cells = [f"{e.lost(link)} ({e.loss_z(link):+.2f})" for e in outcomes.values()]
         lines.append(f"| {link}: lost of {model.links[link]['sent']} (z) | {' | '.join(cells)} |")
         lines.append(f"| {link}: late | {' | '.join(str(e.links[link]['late']) for e in outcomes.values())} |")
     return "\n".join(lines)

@@ -11,18 +11,21 @@ from numpy.typing import NDArray
 from testbed.channel.carriers import carriers_of
 from testbed.channel.loss import LossCounts
 from testbed.channel.processes import FateProcess, goes_on, process_of
+from testbed.channel.real.pace import Pace
 from testbed.channel.real.service import RealLinkService
+from testbed.channel.real.timer import Timer
 from testbed.channel.steps import SteppedLink
 from testbed.channel.timed import TimedBlock, timed_counters
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
 from testbed.scenario import AckLink, Link, Loss, NoLoss, Scenario
+from testbed.scenario.backend import real_links
 from testbed.scenario.changes import changed
 from testbed.scenario.links import SteppedImpairments
 from testbed.wire.codec import PacketEncoder
 from testbed.wire.keys import LinkName
 from testbed.wire.messages import Acknowledgement, Change, Control, Observation, Packet
-from testbed.wire.node import ORCHESTRATOR, Node
+from testbed.wire.node import ORCHESTRATOR, Node, PacketHandler
 from testbed.wire.setup import Setup
 
 _TYPES: dict[LinkName, tuple[type[Packet], str, str]] = {
@@ -124,7 +127,9 @@ class LinkService:
         noise = link == "observation" and scenario.links.observation.on_loss == "noise"
         self._instead = "noise" if noise else None
         needs = (self._content, self._instead) if self._instead else (self._content,)
-        handler = self._pass_on_timed if timed else self._pass_on
+        handler: PacketHandler[Packet] = self._pass_on_timed if timed else self._pass_on
+        if link == "control" and real_links(scenario):
+            handler = Pace(node, node.leaving.enter_context(Timer(node.bus.call)), scenario.clock.period_ns, handler)
         node.on(node.keys.sent(link), model, sender, handler, needs=needs)
         node.on(node.keys.change(link), Change, ORCHESTRATOR, self._note)
 

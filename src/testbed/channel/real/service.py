@@ -6,7 +6,6 @@ import sys
 import time
 from collections import Counter, deque
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -17,6 +16,7 @@ from testbed.channel.real.books import accounted
 from testbed.channel.real.fates import Fates
 from testbed.channel.real.middle import middle_of, scheme_of
 from testbed.channel.real.outstanding import Outstanding
+from testbed.channel.real.pace import Arrays, Pace
 from testbed.channel.real.path import Path
 from testbed.channel.real.timer import Timer
 from testbed.channel.timed import TimedBlock, timed_counters
@@ -35,23 +35,12 @@ _SWITCH_S = 0.0005
 """Threads of this process that handle packets take turns as often."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Waiting:
-    """A packet whose turn has not come. number: 0, 1, … in its block."""
-
-    number: int
-    lane: int
-    lanes: int
-    content: NDArray[Any]
-    message: bytes
-
-
 class RealLinkService:
     """Sends each message over the path as it is, and hands on what arrives, block by block in the order of steps.
 
     A message whose deadline passes before it arrives is lost for its step: that is said then, and if it comes after
     all, it goes with the next step of its block; late control packets are dropped. The control link keeps the pace of
-    the run: packet i leaves no earlier than i periods after packet 0. The other links send at once.
+    the run; the other links send at once.
     """
 
     def __init__(
@@ -61,9 +50,8 @@ class RealLinkService:
         scenario = setup.scenario
         settings: SteppedImpairments = getattr(scenario.links, link)
         self._node, self._name, self._first_step = node, name, model.FIRST_STEP
-        self._period_ns = scenario.clock.period_ns
-        self._deadline_ns = settings.deadline_ns(self._period_ns)
-        self._paced = self._keeps_no_late = link == "control"
+        self._deadline_ns = settings.deadline_ns(scenario.clock.period_ns)
+        self._keeps_late = link != "control"
         self._settings, self._in_order = settings, scheme_of(settings) == "tcp"
         self._changes = scenario.changes_of(link)
         batch = settings.batch if isinstance(settings, AckLink) else 1
@@ -75,9 +63,7 @@ class RealLinkService:
         self._contents: dict[int, deque[NDArray[Any]]] = {lane: deque() for lane in self._blocks}
         """Of packets whose fate is not told yet."""
         self._lanes = max(lanes for _, lanes in setup.blocks)
-        self._queue: deque[_Waiting] = deque()
-        self._start_ns: int | None = None
-        self._behind = self._sent = 0
+        self._sent = 0
         self._newest = -1
         self._under_way: Outstanding[tuple[int, int, int]] = Outstanding()
         """By message: lane, number, place in the order of sending."""
@@ -90,13 +76,15 @@ class RealLinkService:
         path = Path(middle, settings, key, arrived, failed, patience_s=_PATIENCE * setup.transport.deadline_ns * 1e-9)
         self._path = node.leaving.enter_context(path)
         self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
-        node.on(node.keys.sent(link), model, sender, self._take, needs=(name,))
+        self._pace = Pace(node, self._timer, scenario.clock.period_ns, self._send)
+        take = self._pace if link == "control" else self._send
+        node.on(node.keys.sent(link), model, sender, take, needs=(name,))
         node.on(node.keys.change(link), Change, ORCHESTRATOR, self._note)
         self._check()
 
     @property
     def counters(self) -> dict[str, int]:
-        total = Counter(timed_counters(list(self._blocks.values()), keeps_late=not self._keeps_no_late))
+        total = Counter(timed_counters(list(self._blocks.values()), self._keeps_late))
         books: dict[str, dict[str, int]] = {}
         with suppress(TestbedError):  # the run has failed, and said why
             books = self._path.books()
@@ -108,7 +96,7 @@ class RealLinkService:
         total["in_flight"] = over
         total.update(parts)
         total["dropped"] += sum(count for key, count in parts.items() if key.startswith("dropped_"))
-        around = {"behind": self._behind, "repeated": sum(fates.repeated for fates in self._fates.values())}
+        around = {"behind": self._pace.behind, "repeated": sum(fates.repeated for fates in self._fates.values())}
         around |= {f"{where}_{key}": count for where, counts in books.items() for key, count in counts.items()}
         return {**total, **{f"real_{key}": count for key, count in around.items()}}
 
@@ -117,34 +105,14 @@ class RealLinkService:
         self._changes.append((change.step, change.set))
         self._changes.sort(key=lambda entry: entry[0])
 
-    def _take(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
-        number, content = packet.step - self._first_step, np.array(arrays[self._name])
-        self._queue.append(_Waiting(number, packet.lane, packet.lanes, content, self._node.payload))
-        if len(self._queue) == 1:
-            self._send_due()
-
-    def _send_due(self) -> None:
-        """Send the packets whose turn has come, and come back for the next one."""
-        queue, now_ns = self._queue, time.monotonic_ns()
-        if self._start_ns is None:
-            self._start_ns = now_ns
-        while queue:
-            turn_ns = self._start_ns + queue[0].number * self._period_ns
-            if self._paced and turn_ns > now_ns:
-                self._timer.at(turn_ns, self._send_due)
-                return
-            if self._paced and now_ns - turn_ns > self._period_ns:
-                self._behind += 1
-            self._send(queue.popleft(), now_ns)
-
-    def _send(self, packet: _Waiting, now_ns: int) -> None:
-        self._change(packet.number + self._first_step)
-        lane, number = packet.lane, self._fates[packet.lane].sent()
-        self._contents[lane].append(packet.content)
-        self._under_way.add(packet.message, (lane, number, self._sent))
+    def _send(self, packet: Packet, arrays: Arrays) -> None:
+        self._change(packet.step)
+        lane, number, message = packet.lane, self._fates[packet.lane].sent(), self._node.payload
+        self._contents[lane].append(np.array(arrays[self._name]))
+        self._under_way.add(message, (lane, number, self._sent))
         self._sent += 1
-        self._path.send(packet.message)
-        self._timer.at(now_ns + self._deadline_ns, partial(self._give_up, lane, number))
+        self._path.send(message)
+        self._timer.at(time.monotonic_ns() + self._deadline_ns, partial(self._give_up, lane, number))
 
     def _change(self, step: int) -> None:
         while self._changes and self._changes[0][0] <= step:
@@ -169,13 +137,13 @@ class RealLinkService:
         fates, block, contents = self._fates[lane], self._blocks[lane], self._contents[lane]
         while fates.ready:
             number, content = fates.next, contents.popleft()
-            if self._keeps_no_late:
+            if self._keeps_late:
+                arrays = block.pass_on(number, content)
+            else:
                 arrived = block.in_time(number)
                 arrays = {"mask": arrived.astype(np.uint8)}
                 if arrived.any():
                     arrays = {self._name: content, **arrays}
-            else:
-                arrays = block.pass_on(number, content)
             self._deliver(number + self._first_step, lane, len(content), arrays)
 
     def _check(self) -> None:
