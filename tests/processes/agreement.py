@@ -49,8 +49,11 @@ class Outcome:
         return int(self.links[link]["causes"].get("loss", 0))
 
 
-def tables(*, lanes: int, steps: int, period: str, seed: int) -> dict[str, Any]:
-    """UDP-like: no ACK. Each lane has packets, and fates, of its own."""
+def tables(*, lanes: int, steps: int, period: str, seed: int, loss: dict[str, Any] | None = None) -> dict[str, Any]:
+    """UDP-like: no ACK. Each lane has packets, and fates, of its own. loss: of both links, in place of ARRIVAL.
+
+    FF is for independent losses, and does not take part in others.
+    """
     return {
         "name": "agreement",
         "steps": steps,
@@ -61,8 +64,8 @@ def tables(*, lanes: int, steps: int, period: str, seed: int) -> dict[str, Any]:
         "system": SYSTEM,
         "input": {"kind": "sine", "amplitude": 4.0, "period": 7.0},
         "transport": {"lanes_per_packet": 1},
-        "links": {link: {"loss": {"kind": "bernoulli", "arrival": arrival}} for link, arrival in ARRIVAL.items()},
-        "estimators": [{"name": name} for name in ESTIMATORS],
+        "links": {link: {"loss": loss or {"kind": "bernoulli", "arrival": p}} for link, p in ARRIVAL.items()},
+        "estimators": [{"name": name} for name in ESTIMATORS if loss is None or name != "ff"],
     }
 
 
@@ -73,7 +76,7 @@ def run(folder: Path, backend: str, **options: Any) -> Outcome:
     assert code == 0, err
     summary = json.loads((out / "summary.json").read_text())
     arrays = recorded(out, options["lanes"], options["steps"])
-    traces = {name: np.trace(arrays[f"estimate/{name}"]["P"], axis1=2, axis2=3) for name in ESTIMATORS}
+    traces = {name: np.trace(arrays[f"estimate/{name}"]["P"], axis1=2, axis2=3) for name in summary["estimators"]}
     return Outcome(traces, summary["links"], summary)
 
 
@@ -115,12 +118,27 @@ def report(outcomes: dict[str, Outcome]) -> str:
     return "\n".join(lines)
 
 
-def compare(folder: Path, backends: tuple[str, ...], **options: Any) -> dict[str, Outcome]:
-    """A seed of its own for each backend, so that the runs have nothing in common but the scenario."""
-    return {backend: run(folder, backend, seed=seed, **options) for seed, backend in enumerate(backends, start=1)}
+def compare(folder: Path, backends: tuple[str, ...], runs: int, **options: Any) -> dict[str, Outcome]:
+    """Several runs over each backend, with a seed for each, so that they have nothing in common but the scenario."""
+    seeds = iter(range(1, runs * len(backends) + 1))
+    return {b: _together([run(folder, b, seed=next(seeds), **options) for _ in range(runs)]) for b in backends}
+
+
+def _together(outcomes: list[Outcome]) -> Outcome:
+    """The lanes of all runs side by side."""
+    traces = {name: np.concatenate([each.traces[name] for each in outcomes], axis=1) for name in ESTIMATORS}
+    links = {
+        link: {
+            "sent": sum(each.links[link]["sent"] for each in outcomes),
+            "late": sum(each.links[link]["late"] for each in outcomes),
+            "causes": {"loss": sum(each.lost(link) for each in outcomes)},
+        }
+        for link in ARRIVAL
+    }
+    return Outcome(traces, links, {})
 
 
 if __name__ == "__main__":
-    sizes = {"lanes": int(sys.argv[1]), "steps": int(sys.argv[2]), "period": sys.argv[3]}
+    sizes: dict[str, Any] = {"lanes": int(sys.argv[1]), "steps": int(sys.argv[2]), "period": sys.argv[3], "runs": 3}
     with tempfile.TemporaryDirectory() as folder:
         print(report(compare(Path(folder), ("model", "relay", "kernel"), **sizes)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from pathlib import Path
@@ -41,14 +40,18 @@ def test_over_the_relay(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.root
-def test_relay_and_kernel_lose_the_same_packets(tmp_path: Path) -> None:
-    """As many, of those that the pipelines were given after the sessions were open."""
-    relay, kernel = (run(tmp_path, backend, seed=2, **SIZES) for backend in ("relay", "kernel"))
-    checked(kernel)
-    for link in ARRIVAL:
-        one, other = (each.links[link]["real"] for each in (relay, kernel))
-        between = abs(one["forward_sent"] - other["forward_sent"])  # packets of the sessions themselves
-        assert abs(one["forward_dropped_loss"] - other["forward_dropped_loss"]) <= between
+def test_the_same_seed_loses_the_same_packets_over_model_relay_and_kernel(tmp_path: Path) -> None:
+    """With one packet a step the whole runs are the same, to the bit."""
+    sizes = {**SIZES, "lanes": 1}
+    bursty = {"kind": "gilbert-elliott", "to_bad": 0.2, "to_good": 0.4, "loss_good": 0.05, "loss_bad": 0.7}
+    over = {backend: run(tmp_path, backend, seed=2, loss=bursty, **sizes) for backend in ("model", "relay", "kernel")}
+    for backend in ("relay", "kernel"):
+        for link in ARRIVAL:
+            here, there = over[backend].links[link], over["model"].links[link]
+            assert here["real"]["forward_sent"] == sizes["steps"]
+            assert here["causes"]["loss"] == there["causes"]["loss"] > 0
+        if not any(link["late"] for link in over[backend].links.values()):
+            np.testing.assert_array_equal(over[backend].traces["aoe"], over["model"].traces["aoe"])
 
 
 @pytest.mark.slow
@@ -126,7 +129,7 @@ def test_in_process_there_are_no_real_links(tmp_path: Path) -> None:
 @pytest.mark.timeout(400)
 def test_model_relay_and_kernel_agree(tmp_path: Path) -> None:
     """With a seed of its own for each: tr P over the last half, and step by step; and the losses."""
-    outcomes = compare(tmp_path, ("model", "relay", "kernel"), lanes=32, steps=80, period="100 ms")
+    outcomes = compare(tmp_path, ("model", "relay", "kernel"), runs=2, lanes=24, steps=60, period="100 ms")
     for outcome in outcomes.values():
         assert all(abs(outcome.loss_z(link)) < 3.5 for link in ARRIVAL)
     for backend in ("relay", "kernel"):
@@ -135,4 +138,3 @@ def test_model_relay_and_kernel_agree(tmp_path: Path) -> None:
             steps = z_steps(outcomes[backend], outcomes["model"], name)
             assert np.mean(np.abs(steps) <= 1.96) > 0.75
             assert np.abs(steps).max() < 5.0
-    assert json.dumps(outcomes["model"].links) != json.dumps(outcomes["relay"].links)

@@ -90,6 +90,8 @@ def _answer(control: Control, hosts: Hosts) -> bool:
         return False
     if "change" in asked:
         hosts.change(asked["change"], asked["impairments"])
+    if "begin" in asked:
+        hosts.begin(asked["begin"])
     if "end" in asked:
         return False
     try:

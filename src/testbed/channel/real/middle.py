@@ -42,8 +42,11 @@ class Middle(Protocol):
         """What starts the RECEIVER or the SENDER."""
         ...
 
-    def opened(self) -> None:
-        """The ends hear each other: nobody else is let in."""
+    def begin(self, settings: SteppedImpairments) -> None:
+        """The ends hear each other: nobody else is let in, and packet 0 comes next, with impairments.
+
+        But over a TCP proxy, which loses nothing, packets are numbered from the start. Raises TestbedError.
+        """
         ...
 
     def change(self, settings: SteppedImpairments) -> None:
@@ -120,10 +123,13 @@ class RelayMiddle:
     def popen(self, end: str) -> Popen:
         return subprocess.Popen
 
-    def opened(self) -> None:
+    def begin(self, settings: SteppedImpairments) -> None:
         link = self._running()
         if isinstance(link, UdpRelay):
             link.limit_clients(1)
+            link.begin(*directions(settings))
+        else:
+            self.change(settings)
 
     def change(self, settings: SteppedImpairments) -> None:
         link = self._running()
@@ -172,8 +178,8 @@ class KernelMiddle:
     def popen(self, end: str) -> Popen:
         return (self._hosts.b if end == RECEIVER else self._hosts.a).popen
 
-    def opened(self) -> None:
-        """Nobody else is in the namespaces."""
+    def begin(self, settings: SteppedImpairments) -> None:
+        self._hosts.begin(*directions(settings))
 
     def change(self, settings: SteppedImpairments) -> None:
         for direction, impairments in zip(DIRECTIONS, directions(settings), strict=True):

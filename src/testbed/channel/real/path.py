@@ -19,7 +19,7 @@ from testbed.scenario.durations import parse_duration
 from testbed.scenario.links import SteppedImpairments
 
 _MODULE = "testbed.channel.real.ends"
-_PROBE = b"probe"
+_PROBE, _LAST_PROBE = b"probe", b"last probe"
 _PROBE_EVERY_S = 0.05
 _ATTEMPTS = 5
 _LEAVE_S = 0.3
@@ -67,8 +67,7 @@ class Path:
             self._receiver()
             self._sender()
             self._probe()
-            self._middle.opened()
-            self._middle.change(self._settings)
+            self._middle.begin(self._settings)
             self._cleanup = cleanup.pop_all()
         return self
 
@@ -115,11 +114,14 @@ class Path:
             raise RunFailed(f"its {what} was not ready within {self._patience_s:g} s") from None
 
     def _probe(self) -> None:
-        """Until the first message comes through."""
+        """Until a message comes through, and with it all that was sent before: order is kept."""
         while time.monotonic() < self._deadline_s:
             self._outbox.put(_PROBE)
             with suppress(TimeoutError):
                 self._hear(_PROBE_EVERY_S)
+                self._outbox.put(_LAST_PROBE)
+                while self._hear(max(0.0, self._deadline_s - time.monotonic())) != _LAST_PROBE:
+                    pass
                 self._open = True
                 return
             self._check()
@@ -157,8 +159,7 @@ class Path:
         assert process.stdout is not None
         for message in messages(process.stdout):  # type: ignore[arg-type]
             if self._open:
-                if message != _PROBE:
-                    self._arrived(message)
+                self._arrived(message)
             else:
                 self._news.put(message)
         self._ended(process)

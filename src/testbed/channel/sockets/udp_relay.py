@@ -82,6 +82,18 @@ class UdpRelay(SocketLink):
 
         self._loop.call(limit)
 
+    def begin(self, forward: Impairments, backward: Impairments) -> None:
+        """These impairments from the next packet on, which is number 0, with empty books. From any thread.
+
+        What was in flight before is counted as delivered when it is: call it when nothing is.
+        """
+
+        def begin() -> None:
+            for direction, settings in zip(DIRECTIONS, (forward, backward), strict=True):
+                self._pipelines[direction] = self._ways[direction].pipeline = self._pipeline(direction, settings)
+
+        self._loop.call(begin)
+
     def _from_clients(self, _: int) -> None:
         receive, clients, loop, way = self._listener.recvfrom, self._clients, self._loop, self._forward
         for _ in range(_BATCH):
