@@ -81,6 +81,27 @@ def test_it_says_so_where_others_can_reach_it(testbed: Command):
     assert "may be reached from other machines" in outcome.err
 
 
+def test_a_link_whose_transport_is_tcp_needs_tcp_endpoints_and_its_back_is_the_way_back(
+    testbed: Command, tmp_path: Path
+):
+    lossy_back = {"transport": {"kind": "tcp"}, "back": {"loss": {"kind": "bernoulli", "loss": 0.5}}}
+    write(tmp_path / "tcp.toml", links={"control": lossy_back})
+    over_udp = testbed("link", "relay", "tcp.toml", "--link", "control", *UDP)
+    assert (over_udp.code, over_udp.out) == (2, "")
+    assert "the link has transport 'tcp'; allowed: an endpoint of tcp/" in over_udp.err
+    over_tcp = testbed("link", "relay", "tcp.toml", "--link", "control", *TCP)
+    assert (over_tcp.code, over_tcp.out) == (2, "")
+    assert "loss: got 'bernoulli'; a TCP proxy" in over_tcp.err
+
+
+def test_it_says_that_events_are_left_out(testbed: Command, tmp_path: Path):
+    events = [{"at": 5, "action": "set", "link": "control", "set": {"loss": {"arrival": 0.1}}}]
+    write(tmp_path / "events.toml", events=events)
+    outcome = testbed("link", "relay", "events.toml", "--link", "control", *UDP, "--duration", "1 ms")
+    assert outcome.code == 0, outcome.err
+    assert "control: the events of the scenario are left out" in outcome.err
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [

@@ -10,10 +10,17 @@ from typing import Annotated
 import typer
 
 from testbed.cli import link_doctor, link_hosts, link_relay
+from testbed.cli.link_import import import_
 from testbed.cli.link_names import link_name
+from testbed.cli.link_presets import presets
+from testbed.cli.link_report import report
 from testbed.errors import UsageError
 
 app = typer.Typer(help="Look at one link: of a scenario, or of a trace.", rich_markup_mode=None)
+
+app.command("import")(import_)
+app.command()(presets)
+app.command()(report)
 
 _LANE_MAX = 2**31 - 2  # the last lane of the largest scenario
 
@@ -108,7 +115,7 @@ def set_(
     from testbed.scenario.changes import parse_setting, together
 
     change = together([parse_setting(text) for text in settings])
-    answer = ask(run, {"link": link_name(name, "LINK"), "set": change})
+    answer = ask(run, {"link": link_name(name), "set": change})
     typer.echo(f"{name}: from step {answer['step']} on")
 
 

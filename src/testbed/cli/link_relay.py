@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from testbed.channel.sockets.endpoints import Endpoint
     from testbed.channel.sockets.link import Direction, Figures, SocketLink
     from testbed.scenario import Scenario
-    from testbed.scenario.links import Impairments
+    from testbed.scenario.links import SteppedImpairments
 
 
 def relay(
@@ -26,7 +26,8 @@ def relay(
     listen: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where clients connect: udp/ or tcp/HOST:PORT.")],
     to: Annotated[str, typer.Option(metavar="ENDPOINT", help="The target.")],
     back: Annotated[
-        str | None, typer.Option(metavar="LINK", help="The link that impairs the way back; default: nothing does.")
+        str | None,
+        typer.Option(metavar="LINK", help="The link that impairs the way back; default: its own back, if any."),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed; default that of the scenario.")] = None,
     duration: Annotated[
@@ -67,6 +68,8 @@ def relay(
         typer.echo(f"{name}: {shown} to {target}" + ("" if duration else "; Ctrl-C ends it"), err=True)
         if not at.loopback:
             typer.echo(f"{at.host} may be reached from other machines: nothing checks who sends", err=True)
+        if loaded.changes_of(link_name(name)):
+            typer.echo(f"{name}: the events of the scenario are left out, as there are no steps here", err=True)
         with suppress(KeyboardInterrupt):
             link.wait(None if lasts_ns is None else lasts_ns * 1e-9)
     figures, seconds = link.figures(), time.monotonic() - begun
@@ -93,9 +96,12 @@ def _made(
     from testbed.channel.sockets.outages import outage
     from testbed.channel.sockets.tcp_proxy import TcpProxy
     from testbed.channel.sockets.udp_relay import UdpRelay
+    from testbed.scenario.carriers import TcpTransport
 
-    forward = _impairments(scenario, name, "--link")
-    backward = None if back is None else _impairments(scenario, back, "--back")
+    forward = _link(scenario, name, "--link")
+    backward = forward.back if back is None else _link(scenario, back, "--back")
+    if at.scheme == "udp" and isinstance(forward.transport, TcpTransport):
+        raise UsageError(f"--listen {at}: the link has transport 'tcp'; allowed: an endpoint of tcp/")
     traces: dict[Direction, Path] = {}
     if trace is not None:
         traces["forward"] = trace
@@ -118,11 +124,11 @@ def _made(
     return UdpRelay((target.host, target.port), **common)
 
 
-def _impairments(scenario: Scenario, name: str, option: str) -> Impairments:
+def _link(scenario: Scenario, name: str, option: str) -> SteppedImpairments:
     link = link_name(name, option)
     if link == "ack" and scenario.links.ack.mode == "none":
         raise UsageError(f'{option} ack: the scenario has none; allowed: with [links.ack] mode = "perfect" or "link"')
-    settings: Impairments = getattr(scenario.links, link)
+    settings: SteppedImpairments = getattr(scenario.links, link)
     return settings
 
 

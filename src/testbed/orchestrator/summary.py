@@ -119,6 +119,9 @@ class LinkFigures(_Model):
     in_flight: NonNegativeInt = 0
     corrupted: NonNegativeInt = Field(default=0, description="copies that arrived with a bit flipped")
     causes: dict[str, NonNegativeInt] = Field(default_factory=dict, description="those dropped, by cause")
+    transport: dict[str, NonNegativeInt] = Field(
+        default_factory=dict, description="what connections did: retransmissions, recoveries, timeouts, probes, …"
+    )
     real: dict[str, NonNegativeInt] = Field(
         default_factory=dict,
         description="of a link through real sockets: packets that left more than a period late (behind), and the books "

@@ -6,6 +6,8 @@ import csv
 import hashlib
 import json
 import os
+import shlex
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -198,6 +200,16 @@ def test_commands_that_are_not_there_and_sizes_that_cannot_be() -> None:
         pair.a.popen(["no-such-program"])
     with pytest.raises(UsageError, match="mtu: got 100; allowed: 576 … 65535"):
         hosts(link(), mtu=100)
+
+
+def test_another_terminal_finds_the_way_in() -> None:
+    if shutil.which("nsenter") is None:
+        pytest.skip("there is no command nsenter")
+    with hosts(link()) as pair:
+        for host in (pair.a, pair.b):
+            command = [*shlex.split(pair.entrances[host.name]), "readlink", "/proc/self/ns/net"]
+            found = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True).stdout.strip()
+            assert found == network_of(host)
 
 
 def test_without_rights_user_namespaces_will_do(tmp_path: Path) -> None:

@@ -25,8 +25,7 @@ from testbed.channel.kernel.namespaces import (
     sharp_timers,
 )
 from testbed.channel.kernel.plan import Hosts, Plan, Refused
-
-_NICE = -10
+from testbed.errors import TestbedError
 
 
 def main(fd: int, owner: int) -> int:
@@ -46,9 +45,12 @@ def main(fd: int, owner: int) -> int:
     except Refused as refused:
         control.send({"refused": str(refused)})
         return 1
+    except TestbedError as error:
+        control.send({"wrong": str(error)})
+        return 1
     sharp_timers()
-    with suppress(OSError):  # without root rights as the others
-        os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+    with suppress(OSError):  # without root rights, like any other process
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     gc.freeze()
     gc.disable()
     try:
@@ -88,14 +90,18 @@ def _answer(control: Control, hosts: Hosts) -> bool:
         asked, _ = control.receive()
     except EOFError:
         return False
-    if "change" in asked:
-        hosts.change(asked["change"], asked["impairments"])
-    if "begin" in asked:
-        hosts.begin(asked["begin"])
     if "end" in asked:
         return False
     try:
-        control.send({"books": hosts.books()})
+        if "change" in asked:
+            hosts.change(asked["change"], asked["impairments"])
+        if "begin" in asked:
+            hosts.begin(asked["begin"])
+        answer: dict[str, object] = {"books": hosts.books()}
+    except TestbedError as error:
+        answer = {"wrong": str(error)}
+    try:
+        control.send(answer)
     except OSError:
         return False
     return True

@@ -196,6 +196,8 @@ class Hosts:
             raise RunFailed(f"the process of the link ended{self._ending()}") from None
         except TimeoutError:
             raise RunFailed(f"no answer from the process of the link for {_PATIENCE_S:g} s") from None
+        if "wrong" in answer:
+            raise UsageError(answer["wrong"])
         if "refused" in answer:
             raise UsageError(
                 f"no hosts on this machine: {answer['refused']}; allowed: what `testbed link doctor` shows as ok, "

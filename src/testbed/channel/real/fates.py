@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
 from testbed.channel.books import Books
@@ -32,6 +34,11 @@ class Fates:
     def books(self) -> Books:
         """Of lane-packets: those handed over are delivered; whether another is lost or in flight is not known here."""
         return Books(sent=self._lanes * self._sent, delivered=self._delivered)
+
+    @property
+    def transport(self) -> Counter[str]:
+        """The kernel does not tell."""
+        return Counter()
 
     @property
     def next(self) -> int:

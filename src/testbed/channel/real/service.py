@@ -19,7 +19,7 @@ from testbed.channel.real.outstanding import Outstanding
 from testbed.channel.real.pace import Arrays, Pace
 from testbed.channel.real.path import Path
 from testbed.channel.real.timer import Timer
-from testbed.channel.timed import TimedBlock, timed_counters
+from testbed.channel.timed import TimedBlock, room, timed_counters
 from testbed.errors import RunFailed, TestbedError
 from testbed.scenario.changes import changed
 from testbed.scenario.links import AckLink, SteppedImpairments
@@ -55,9 +55,10 @@ class RealLinkService:
         self._settings, self._in_order = settings, scheme_of(settings) == "tcp"
         self._changes = scenario.changes_of(link)
         batch = settings.batch if isinstance(settings, AckLink) else 1
+        keep = room(scenario.lanes, 8 * max(scenario.system.p, scenario.system.q), batch)
         self._fates = {lane: Fates(lanes) for lane, lanes in setup.blocks}
         self._blocks = {
-            lane: TimedBlock(self._fates[lane], lanes, name, first_step=model.FIRST_STEP, batch=batch)
+            lane: TimedBlock(self._fates[lane], lanes, name, first_step=model.FIRST_STEP, keep=keep, batch=batch)
             for lane, lanes in setup.blocks
         }
         self._contents: dict[int, deque[NDArray[Any]]] = {lane: deque() for lane in self._blocks}
