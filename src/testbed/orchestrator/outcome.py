@@ -89,6 +89,7 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
         in_flight=counters.get("in_flight", 0),
         corrupted=counters.get("corrupted", 0),
         causes=causes or losses,
+        real={key.removeprefix("real_"): n for key, n in counters.items() if key.startswith("real_")},
         transitions=Transitions.model_validate({key: counters[key] for key in ("00", "01", "10", "11")}),
         loss_rate=(sent - min(sent, counters["delivered"] + counters.get("in_flight", 0))) / sent if sent else None,
         mean_burst=(counters["00"] + bursts) / bursts if bursts else None,

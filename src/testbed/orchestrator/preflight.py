@@ -8,6 +8,7 @@ from testbed.errors import UsageError
 from testbed.estimator.buffers import acks_of
 from testbed.estimator.registry import check, model_of
 from testbed.scenario import Scenario
+from testbed.scenario.backend import real_links
 
 
 def check_estimators(scenario: Scenario) -> None:
@@ -17,6 +18,17 @@ def check_estimators(scenario: Scenario) -> None:
     model = model_of(scenario)
     for spec in scenario.estimators:
         check(spec, model, acks=acks_of(scenario, spec), scenario=scenario)
+
+
+def check_processes(scenario: Scenario) -> None:
+    """Raises UsageError for links that need real time and processes, where there are none."""
+    names = real_links(scenario)
+    if names:
+        backend = getattr(scenario.links, names[0]).backend
+        raise UsageError(
+            f"links.{names[0]}.backend: got {backend!r} with --in-process; allowed there: model (--links model), or "
+            "without --in-process"
+        )
 
 
 def prepare_folder(out: Path) -> None:

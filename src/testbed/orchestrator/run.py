@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
+from testbed.channel.real.check import check_links
 from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.interrupts import Interrupts, noted
 from testbed.orchestrator.outcome import summarise
-from testbed.orchestrator.preflight import check_estimators, prepare_folder
+from testbed.orchestrator.preflight import check_estimators, check_processes, prepare_folder
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.roles import RoleSpec, roles_of
 from testbed.orchestrator.running import published
@@ -53,6 +54,7 @@ class Run:
     ) -> None:
         """Raises UsageError where the scenario cannot run or the folder cannot be written, before anything starts."""
         check_estimators(scenario)
+        check_links(scenario)
         prepare_folder(out)
         self._out, self._progress, self._say = out, progress, say
         self._setup = Setup(secrets.token_hex(6), scenario)
@@ -105,7 +107,11 @@ class Run:
 
     @np.errstate(all="ignore")
     def in_process(self, schedule: int | None = None) -> Summary:
-        """On the in-process bus; ``schedule`` seeds the order in which messages to different roles are delivered."""
+        """On the in-process bus; ``schedule`` seeds the order in which messages to different roles are delivered.
+
+        Raises UsageError where a link needs real time and processes.
+        """
+        check_processes(self._setup.scenario)
         network = MemoryNetwork(schedule)
         recorder = self._recorder()
         conductor = self._conductor(network.bus(), recorder)

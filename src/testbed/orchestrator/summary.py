@@ -122,6 +122,11 @@ class LinkFigures(_Model):
     transport: dict[str, NonNegativeInt] = Field(
         default_factory=dict, description="what connections did: retransmissions, recoveries, timeouts, probes, …"
     )
+    real: dict[str, NonNegativeInt] = Field(
+        default_factory=dict,
+        description="of a link through real sockets: packets that left more than a period late (behind), and the books "
+        "of its packets, forward and backward",
+    )
     transitions: Transitions = Transitions()
     loss_rate: Number = None
     mean_burst: Number = Field(default=None, description="mean number of packets lost in a row")

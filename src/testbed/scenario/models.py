@@ -87,7 +87,8 @@ class Scenario(Part):
         observation = links.observation
         if observation.on_loss == "noise" and observation.takes_time:
             raise problem(
-                "got 'noise' on a link with a delay, rate, order, copies, bit errors or a clock of its own; "
+                "got 'noise' on a link with a delay, rate, order, copies, bit errors, a transport, a clock of its own "
+                "or a real backend; "
                 "allowed there: nothing",
                 "observation.on_loss",
             )
