@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from testbed.analysis.differences import Difference, average, paired
+from testbed.analysis.differences import Difference, average, paired, t_interval, t_test
 from testbed.numerics.lanes import Floats
 
 LENGTHS = 8
@@ -34,19 +34,18 @@ def batched(a: Floats, b: Floats) -> Difference:
         note = f"{steps} steps are too few for an interval: the differences are correlated over {time:.3g} steps"
         return Difference("batch means", batches, 0, mean_a, mean_b, average(a - b), note=note)
     means = [np.array([part.mean() for part in np.array_split(series, batches)]) for series in (a, b)]
-    found = paired(*means)
+    found, difference = paired(*means), average(a - b)
     return Difference(
         "batch means",
         batches,
         0,
         mean_a,
         mean_b,
-        average(a - b),
+        difference,
         found.stderr,
-        found.interval,
-        found.p_value,
-        ratio=found.ratio,
-        ratio_interval=found.ratio_interval,
+        t_interval(difference, found.stderr, batches - 1),
+        t_test(difference, found.stderr, batches - 1),
+        ratio=mean_a / mean_b if mean_a > 0.0 < mean_b else None,
         note=f"{batches} batches of {steps // batches} steps or one more; correlated over {time:.3g} steps",
     )
 

@@ -16,15 +16,15 @@ from testbed.orchestrator.report.figures.ratio import ratios
 from testbed.orchestrator.report.link_model import Expected, expected_links
 from testbed.orchestrator.summary import Summary
 
-_ENVIRONMENT = jinja2.Environment(
+ENVIRONMENT = jinja2.Environment(
     loader=jinja2.PackageLoader("testbed.orchestrator.report"),
     autoescape=True,
     undefined=jinja2.StrictUndefined,
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters.update(number=text.number, count=text.count, share=text.share, band=text.band)
-_ENVIRONMENT.globals.update(plus_minus=text.plus_minus, plural=text.plural, steps_range=text.steps)
+ENVIRONMENT.filters.update(number=text.number, count=text.count, share=text.share, band=text.band)
+ENVIRONMENT.globals.update(plus_minus=text.plus_minus, plural=text.plural, steps_range=text.steps)
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class PageFigure:
 def report_html(summary: Summary, scenario_toml: str) -> str:
     """The whole page; see `testbed.orchestrator.report.write_report`."""
     expected = expected_links(summary, scenario_toml)
-    return _ENVIRONMENT.get_template("report.html").render(
+    return ENVIRONMENT.get_template("report.html").render(
         summary=summary,
         scenario_toml=scenario_toml,
         drawn=_figures(summary, expected),
@@ -93,12 +93,13 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
     ]
     shown = [entry for entry in available if entry[1]]
     return {
-        name: _page_figure(number, name, draw, numbers(), label)
+        name: page_figure(number, name, draw, numbers(), label)
         for number, (name, _, draw, numbers, label) in enumerate(shown, start=1)
     }
 
 
-def _page_figure(number: int, name: str, draw: Callable[[], Figure], numbers: str, label: str) -> PageFigure:
+def page_figure(number: int, name: str, draw: Callable[[], Figure], numbers: str, label: str) -> PageFigure:
+    """Draw a figure, in the look of the report."""
     with svg.look():
         document = svg.svg_text(draw())
     return PageFigure(
