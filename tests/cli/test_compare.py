@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,8 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Runs one and two, which differ in a link, and other, of another seed."""
     out = tmp_path_factory.mktemp("runs")
     link = {"loss": {"kind": "bernoulli", "arrival": 0.9}}
-    for name, changes in {"one": {}, "two": {"links": {"observation": link}}, "other": {"seed": 9}}.items():
+    variants: dict[str, dict[str, Any]] = {"one": {}, "two": {"links": {"observation": link}}, "other": {"seed": 9}}
+    for name, changes in variants.items():
         run(parse_scenario({**TABLES, **changes}), out / name)
     return out
 
