@@ -91,6 +91,12 @@ def test_equal_differences_have_no_spread() -> None:
     assert welch(np.ones(3), np.zeros(3)).p_value == 0.0
 
 
+def test_what_rounding_can_do_is_no_difference() -> None:
+    found = paired(A * (1 + 1e-14), A)
+    assert (found.difference, found.p_value, found.a_smaller) == (0.0, 1.0, None)
+    assert paired(A * (1 + 1e-11), A).p_value != 1.0
+
+
 def test_values_that_are_not_finite_are_left_out_and_counted() -> None:
     a, b = np.append(A, [math.nan, 1.0, math.inf]), np.append(B, [1.0, math.nan, 2.0])
     found = paired(a, b)

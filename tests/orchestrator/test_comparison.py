@@ -50,9 +50,10 @@ def runs(folders: dict[str, Path]) -> dict[str, RunFigures]:
     return {name: load_run(folder) for name, folder in folders.items()}
 
 
-def lane_means(of: RunFigures, name: str, figure: str, first: int, last: int) -> np.ndarray:
+def lane_means(of: RunFigures, name: str | None, figure: str, first: int, last: int) -> np.ndarray:
     """(lanes,) over the steps first … last; every step is a window here."""
     assert of.lanes.ends.tolist() == list(range(1, STEPS + 1))
+    assert name is not None
     means: np.ndarray = of.lanes.figures[name][figure][first - 1 : last].mean(axis=0)
     return means
 
@@ -154,6 +155,29 @@ def test_against_one_or_all_of_a_name(runs: dict[str, RunFigures]) -> None:
     assert "\n" not in str(caught.value)
     with pytest.raises(UsageError, match="allowed: trace_P, squared_error, nees; did you mean 'trace_P'"):
         compare(two, figure="traceP")
+
+
+def test_a_figure_of_the_whole_run(runs: dict[str, RunFigures]) -> None:
+    rng = np.random.default_rng(5)
+    costs = rng.gamma(3.0, size=(2, STEPS, LANES))
+
+    def priced(of: RunFigures, cost: np.ndarray) -> RunFigures:
+        return replace(of, lanes=replace(of.lanes, whole={"cost": cost}))
+
+    one, other = priced(runs["first"], costs[0]), priced(runs["lossy"], costs[1])
+    found = compare([one, other], figure="cost", whole=True)
+    (pair,) = found.pairs
+    assert (found.name(pair.a), found.name(pair.b), pair.first, pair.last) == ("first", "lossy", 1, STEPS)
+    expected = stats.ttest_rel(costs[0].mean(axis=0), costs[1].mean(axis=0)).confidence_interval(0.95)
+    assert pair.found.interval == pytest.approx(expected, rel=1e-9)
+    assert compare([one, other], figure="cost", against="lossy").pairs[0].b == Item("lossy", None)
+    assert "<td>first</td>" in comparison_html(found)
+    with pytest.raises(UsageError, match="nothing to compare with"):
+        compare([one], figure="cost")
+    with pytest.raises(UsageError, match="--figure cost: again has none; allowed: a figure of all the runs"):
+        compare([one, runs["again"]], figure="cost")
+    with pytest.raises(UsageError, match=r"allowed: trace_P, squared_error, nees$"):
+        compare([runs["first"]], figure="cost")
 
 
 def test_windows_of_several_steps_are_merged_to_those_both_have(runs: dict[str, RunFigures]) -> None:

@@ -104,11 +104,14 @@ def test_a_step_without_a_figure_leaves_its_window_without_one() -> None:
 
 def test_a_file_reads_back_as_it_was(tmp_path: Path) -> None:
     values = np.arange(12.0).reshape(3, 4)
-    write_lanes(tmp_path / NAME, LaneFigures(np.array([1, 2, 5]), {"a-b": {"trace_P": values, "nees": values[:2]}}))
+    estimators = {"a-b": {"trace_P": values, "nees": values[:2]}}
+    write_lanes(tmp_path / NAME, LaneFigures(np.array([1, 2, 5]), estimators, {"cost": 2.0 * values}))
     found = read_lanes(tmp_path / NAME)
     assert found.ends.tolist() == [1, 2, 5]
     np.testing.assert_array_equal(found.figures["a-b"]["trace_P"], values)
     np.testing.assert_array_equal(found.figures["a-b"]["nees"], values[:2])
+    np.testing.assert_array_equal(found.whole["cost"], 2.0 * values)
+    assert (list(found.figures), list(found.whole)) == (["a-b"], ["cost"])
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
 
 

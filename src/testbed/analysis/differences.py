@@ -19,6 +19,8 @@ FEW = 30
 """Samples below this number get a bootstrap interval besides."""
 SKEWED = 0.01
 """So do those of which skewness moves the error of one tail of the t interval by more than this."""
+ROUNDING = 1e-12
+"""Pairs that differ by less, relatively, count as equal."""
 _Z = 1.959963984540054
 
 Method = Literal["paired t", "Welch", "batch means"]
@@ -57,7 +59,7 @@ def paired(a: Floats, b: Floats, *, heavy: bool = False) -> Difference:
     n = len(a)
     if n == 0:
         return Difference("paired t", 0, left_out, None, None, None)
-    d = a - b
+    d = np.where(np.abs(a - b) <= ROUNDING * np.maximum(np.abs(a), np.abs(b)), 0.0, a - b)
     mean_a, mean_b, mean = average(a), average(b), average(d)
     stderr = _stderr(d)
     smaller, decided = int(np.count_nonzero(d < 0)), int(np.count_nonzero(d))

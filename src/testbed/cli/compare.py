@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 def compare(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN…", help="Folders of runs; of one, its estimators.")],
     figure: Annotated[
-        str, typer.Option(metavar="FIGURE", help="trace_P, squared_error or nees: of each lane its mean over steps.")
+        str,
+        typer.Option(
+            metavar="FIGURE", help="trace_P, squared_error, nees or another of lanes.npz: its mean over steps."
+        ),
     ] = "trace_P",
     against: Annotated[
         str | None, typer.Option(metavar="NAME", help="Compare with this ESTIMATOR or RUN/ESTIMATOR only.")

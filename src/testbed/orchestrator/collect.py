@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from testbed.numerics.lanes import Component, Matrix, Vector, matrix_of, vector_of
 from testbed.orchestrator.lane_windows import window_ends
 from testbed.orchestrator.lanes_file import LaneFigures
-from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures, prepare
+from testbed.orchestrator.statistics import ERROR_FIGURES, LANE_FIGURES, Series, error_figures, prepare
 from testbed.wire.setup import Setup
 
 Arrays = dict[str, NDArray[Any]]
@@ -49,7 +49,8 @@ class Collector:
         self._count = scenario.steps
         self._windows = window_ends(scenario.steps, scenario.lanes, self._until.values())
         self.estimators = {
-            spec.name: Series(ERROR_FIGURES, scenario.lanes, self._windows) for spec in scenario.estimators
+            spec.name: Series(ERROR_FIGURES, scenario.lanes, kept=len(LANE_FIGURES), ends=self._windows)
+            for spec in scenario.estimators
         }
         self.bounds = Series(("lower", "upper", "upper_correlated"), scenario.lanes)
         self.completed = 0

@@ -60,12 +60,13 @@ def _compute(n: int, lanes: int) -> Callable[..., tuple[Component, ...]]:
 class Series:
     """Mean and standard error over lanes of some figures along k; a step's lanes may come in any blocks and order.
 
-    ``ends``: those of the windows over which the figures of each lane are averaged; left out: no lane is kept.
+    ``kept``: how many of the first of them are kept of each lane, averaged over windows of steps with these ``ends``.
     """
 
-    def __init__(self, names: tuple[str, ...], lanes: int, ends: tuple[int, ...] = ()) -> None:
+    def __init__(self, names: tuple[str, ...], lanes: int, *, kept: int = 0, ends: tuple[int, ...] = ()) -> None:
         self.names, self._lanes = names, lanes
-        self._windows = LaneWindows(ends, len(LANE_FIGURES), lanes) if ends else None
+        self._kept = names[:kept]
+        self._windows = LaneWindows(ends, kept, lanes) if kept else None
         self._open: dict[int, Figures | LaneMoments] = {}
         self._closed: list[Figures | list[Result] | None] = []
 
@@ -116,11 +117,11 @@ class Series:
         assert self._windows is not None
         windows = self._windows
         if self._lanes == 1:  # nothing was added on the way: the steps are all here
-            windows = LaneWindows(windows.ends, len(LANE_FIGURES), 1)
+            windows = LaneWindows(windows.ends, len(self._kept), 1)
             rows = [row if isinstance(row, dict) else {} for row in self._closed[:last]]
-            windows.add_from_start(np.array([[row.get(name, math.nan) for row in rows] for name in LANE_FIGURES]))
+            windows.add_from_start(np.array([[row.get(name, math.nan) for row in rows] for name in self._kept]))
         means = windows.means(last)
-        return {name: means[:, i] for i, name in enumerate(LANE_FIGURES)}
+        return {name: means[:, i] for i, name in enumerate(self._kept)}
 
     def _results(self) -> dict[str, list[Result]]:
         rows = [[_ABSENT] * len(self.names) if row is None else self._row(row) for row in self._closed]

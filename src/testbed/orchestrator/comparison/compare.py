@@ -17,18 +17,24 @@ from testbed.orchestrator.comparison.runs import RunFigures, apart, besides
 from testbed.orchestrator.lane_windows import first_settled
 from testbed.orchestrator.statistics import LANE_FIGURES
 
-_MOMENTS = {"trace_P", "squared_error"}
-"""Figures whose mean or variance the losses can make infinite."""
+_NORMALISED = {"nees"}
+"""Figures whose law does not depend on how large the covariance is: losses do not make their moments infinite."""
 _BLURRED = {"squared_error", "nees"}
 """Those that rounding of a large state spoils."""
 
 
 @dataclass(frozen=True)
 class Item:
-    """One estimator of one run."""
+    """One estimator of one run; ``estimator`` None: the run as a whole."""
 
     run: str
-    estimator: str
+    estimator: str | None
+
+    def told(self, several_runs: bool = True) -> str:
+        """RUN/ESTIMATOR, RUN, or ESTIMATOR where there is one run."""
+        if self.estimator is None:
+            return self.run
+        return f"{self.run}/{self.estimator}" if several_runs else self.estimator
 
 
 @dataclass(frozen=True)
@@ -67,8 +73,8 @@ class Comparison:
     notes: tuple[str, ...]
 
     def name(self, item: Item) -> str:
-        """RUN/ESTIMATOR, or the estimator's name alone where there is one run."""
-        return f"{item.run}/{item.estimator}" if self.several_runs else item.estimator
+        """What it is called."""
+        return item.told(self.several_runs)
 
 
 def compare(
@@ -86,31 +92,40 @@ def compare(
     several runs is compared only with itself. ``whole``: over all the steps of both, not the last quarter.
     ``unpaired``: lanes of different runs are independent. Raises UsageError where that cannot be.
     """
-    if figure not in LANE_FIGURES:
-        hint = did_you_mean(figure, LANE_FIGURES)
-        raise UsageError(f"--figure {figure}: no such figure; allowed: {', '.join(LANE_FIGURES)}{hint}")
+    kept = dict.fromkeys(figure for run in runs for figure in (*LANE_FIGURES, *run.lanes.whole))
+    if figure not in kept:
+        raise UsageError(f"--figure {figure}: no such figure; allowed: {', '.join(kept)}{did_you_mean(figure, kept)}")
     by_label = {run.label: run for run in runs}
-    chosen = _chosen(runs, against, every)
+    chosen = _chosen(runs, figure, against, every)
     notes = [] if unpaired else _pairing(runs)
     if unpaired:
         notes += _independence(runs)
-    heavy = figure in _MOMENTS and any(_not_ok(run, "finite mean", "finite variance") for run in runs)
+    heavy = figure not in _NORMALISED and any(_not_ok(run, "finite mean", "finite variance") for run in runs)
     pairs = [_pair(by_label, a, b, figure, whole=whole, unpaired=unpaired, heavy=heavy) for a, b in chosen]
     adjusted = holm([pair.found.p_value for pair in pairs])
     pairs = [replace(pair, p_holm=p) for pair, p in zip(pairs, adjusted, strict=True)]
-    several = len(runs) > 1
-    made = Comparison(figure, runs[0].summary.lanes, several, tuple(pairs), ())
+    made = Comparison(figure, runs[0].summary.lanes, len(runs) > 1, tuple(pairs), ())
     return replace(made, notes=(*notes, *_cautions(runs, figure), *_of_pairs(made, unsure=heavy)))
 
 
-def _chosen(runs: Sequence[RunFigures], against: str | None, every: bool) -> list[tuple[Item, Item]]:
-    items = [Item(run.label, name) for run in runs for name in run.lanes.figures]
+def _items(runs: Sequence[RunFigures], figure: str) -> list[Item]:
+    """What has the figure. Raises UsageError where only some of the runs have it."""
+    if figure in LANE_FIGURES:
+        return [Item(run.label, name) for run in runs for name in run.lanes.figures]
+    for run in runs:
+        if figure not in run.lanes.whole:
+            raise UsageError(f"--figure {figure}: {run.label} has none; allowed: a figure of all the runs")
+    return [Item(run.label, None) for run in runs]
+
+
+def _chosen(runs: Sequence[RunFigures], figure: str, against: str | None, every: bool) -> list[tuple[Item, Item]]:
+    items = _items(runs, figure)
     pairs = list(combinations(items, 2))
     if against is not None:
-        fixed = [item for item in items if against in (item.estimator, f"{item.run}/{item.estimator}")]
-        names = list(dict.fromkeys(item.estimator for item in items))
+        fixed = [item for item in items if against in (item.estimator, item.told())]
+        names = list(dict.fromkeys(item.estimator or item.run for item in items))
         if len(runs) > 1:
-            names += [f"{item.run}/{item.estimator}" for item in items]
+            names += [item.told() for item in items if item.estimator is not None]
         if not fixed:
             hint = did_you_mean(against, names)
             raise UsageError(f"--against {against}: no such estimator; allowed: {', '.join(names)}{hint}")
@@ -122,7 +137,7 @@ def _chosen(runs: Sequence[RunFigures], against: str | None, every: bool) -> lis
         across = [(a, b) for a, b in pairs if a.run != b.run]
         pairs = [(a, b) for a, b in across if a.estimator == b.estimator] or across
     if not pairs:
-        raise UsageError("one run with one estimator: nothing to compare with; allowed: several of either")
+        raise UsageError("nothing to compare with; allowed: several runs, or estimators of a run")
     return pairs
 
 
@@ -165,11 +180,14 @@ def _on_common_windows(
 ) -> tuple[NDArray[np.int64], Floats, Floats]:
     """The ends of the windows that two estimators share, and the figures of both over them, (windows, lanes)."""
     lanes = [runs[item.run].lanes for item in (a, b)]
-    values = [of.figures[item.estimator][figure] for of, item in zip(lanes, (a, b), strict=True)]
+    values = [
+        of.whole[figure] if item.estimator is None else of.figures[item.estimator][figure]
+        for of, item in zip(lanes, (a, b), strict=True)
+    ]
     ends = [of.ends[: len(rows)] for of, rows in zip(lanes, values, strict=True)]
     common = np.intersect1d(ends[0], ends[1])
     if not len(common):
-        raise UsageError(f"{a.run}/{a.estimator}, {b.run}/{b.estimator}: no step that both ran to its end")
+        raise UsageError(f"{a.told()}, {b.told()}: no step that both ran to its end")
     one, other = (_merged(rows, own, common) for rows, own in zip(values, ends, strict=True))
     return common, one, other
 
@@ -220,7 +238,7 @@ def _cautions(runs: Sequence[RunFigures], figure: str) -> list[str]:
         name = f"{run.label}: " if len(runs) > 1 else ""
         if run.summary.status != "complete":
             notes.append(f"{name}{run.summary.status} after {run.summary.completed_steps} of {run.summary.steps} steps")
-        if figure in _MOMENTS:
+        if figure not in _NORMALISED:
             notes += [
                 f"{name}{check.text}"
                 for check in run.summary.checks

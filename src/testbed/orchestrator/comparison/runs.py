@@ -51,7 +51,7 @@ def load_run(folder: Path, label: str | None = None) -> RunFigures:
     except OSError as error:
         raise UsageError(f"cannot read {folder / 'summary.json'}: {(error.strerror or str(error)).lower()}") from None
     lanes = read_lanes(folder / NAME)
-    wide = {values.shape[1] for of in lanes.figures.values() for values in of.values()}
+    wide = {values.shape[1] for values in lanes.all}
     if set(lanes.figures) != set(summary.estimators) or wide - {summary.lanes}:
         raise UsageError(f"{folder}: {NAME} and summary.json are not of the same run")
     return RunFigures(label or folder.resolve().name, load_scenario(folder / "scenario.toml"), summary, lanes)
@@ -60,10 +60,10 @@ def load_run(folder: Path, label: str | None = None) -> RunFigures:
 def apart(one: RunFigures, other: RunFigures) -> list[str]:
     """What keeps the lanes of two runs from meeting the same noise at the same steps of the same plant.
 
-    The input counts where it is the same whatever the estimators do: with feedback only its law may differ.
+    The input counts unless it follows an estimate: closed loops may differ in their controllers.
     """
     keys = [*_NOISE]
-    if not _fed_back(one) and not _fed_back(other):
+    if not _closed(one) and not _closed(other):
         keys.append("input")
     return _differing(one, other, keys)
 
@@ -73,8 +73,8 @@ def besides(one: RunFigures, other: RunFigures) -> list[str]:
     return [key for key in _differing(one, other, _COURSE) if key not in apart(one, other)]
 
 
-def _fed_back(run: RunFigures) -> bool:
-    return run.scenario.input is not None and run.scenario.input.kind == "feedback"
+def _closed(run: RunFigures) -> bool:
+    return hasattr(run.scenario.input, "estimator")
 
 
 def _differing(one: RunFigures, other: RunFigures, keys: Sequence[str]) -> list[str]:

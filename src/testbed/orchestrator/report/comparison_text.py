@@ -6,7 +6,7 @@ from testbed.analysis.differences import Method
 from testbed.orchestrator.comparison import Comparison
 from testbed.orchestrator.report import text
 
-FIGURES = {"trace_P": "tr P", "squared_error": "‖x − x̂‖²", "nees": "NEES"}
+_FIGURES = {"trace_P": "tr P", "squared_error": "‖x − x̂‖²", "nees": "NEES"}
 _METHODS: dict[Method, str] = {
     "paired t": "Student's t of the differences lane by lane",
     "Welch": "Welch's, for independent lanes",
@@ -14,9 +14,14 @@ _METHODS: dict[Method, str] = {
 }
 
 
+def figure_name(found: Comparison) -> str:
+    """The figure that is compared."""
+    return _FIGURES.get(found.figure, found.figure)
+
+
 def headline(found: Comparison) -> str:
     """What is compared."""
-    return f"{FIGURES[found.figure]}, mean over steps; {text.plural(found.lanes, 'lane')}"
+    return f"{figure_name(found)}, mean over steps; {text.plural(found.lanes, 'lane')}"
 
 
 def explanations(found: Comparison) -> list[str]:

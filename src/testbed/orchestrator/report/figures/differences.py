@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from testbed.orchestrator.comparison import Comparison, Pair
-from testbed.orchestrator.report.comparison_text import FIGURES
+from testbed.orchestrator.report.comparison_text import figure_name
 from testbed.orchestrator.report.figures import axes as common
 from testbed.orchestrator.report.svg import WIDTH_IN, colour
 
@@ -34,7 +34,7 @@ def draw(found: Comparison) -> Figure:
         _panel(axes, pair, colour(index))
         if index + columns >= len(shown):
             axes.set_xlabel("step $k$")
-    figure.supylabel(f"difference of {FIGURES[found.figure]}", fontsize=9, parse_math=False)
+    figure.supylabel(f"difference of {figure_name(found)}", fontsize=9, parse_math=False)
     return figure
 
 
