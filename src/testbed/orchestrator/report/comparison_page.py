@@ -11,7 +11,7 @@ import numpy as np
 from testbed.orchestrator.comparison import Comparison
 from testbed.orchestrator.report.comparison_text import explanations, headline
 from testbed.orchestrator.report.figures import differences
-from testbed.orchestrator.report.page import ENVIRONMENT, page_figure
+from testbed.orchestrator.report.html import ENVIRONMENT, page_figure
 
 
 def comparison_html(found: Comparison) -> str:
