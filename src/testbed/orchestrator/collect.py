@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.numerics.lanes import Component, Matrix, Vector, matrix_of, vector_of
-from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures, prepare
+from testbed.orchestrator.lane_windows import window_ends
+from testbed.orchestrator.lanes_file import LaneFigures
+from testbed.orchestrator.statistics import ERROR_FIGURES, LANE_FIGURES, Series, error_figures, prepare
 from testbed.wire.setup import Setup
 
 Arrays = dict[str, NDArray[Any]]
@@ -45,7 +47,11 @@ class Collector:
         self._words = {name: f"estimate of {name}" for name in self._until}
         self._with_bounds = scenario.bounds
         self._count = scenario.steps
-        self.estimators = {spec.name: Series(ERROR_FIGURES, scenario.lanes) for spec in scenario.estimators}
+        self._windows = window_ends(scenario.steps, scenario.lanes, self._until.values())
+        self.estimators = {
+            spec.name: Series(ERROR_FIGURES, scenario.lanes, kept=len(LANE_FIGURES), ends=self._windows)
+            for spec in scenario.estimators
+        }
         self.bounds = Series(("lower", "upper", "upper_correlated"), scenario.lanes)
         self.completed = 0
         self.estimated = 0
@@ -95,6 +101,12 @@ class Collector:
                 figures[name] = _component(arrays[f"trace_{name}"])
         self.bounds.add(step, lane, figures)
         self._done(self._of(step), lane, BOUNDS)
+
+    def by_lane(self) -> LaneFigures:
+        """The figures of each lane, over the windows of completed steps."""
+        ends = np.array([end for end in self._windows if end <= self.completed], dtype=np.int64)
+        lasts = {name: min(until, self.completed) for name, until in self._until.items()}
+        return LaneFigures(ends, {name: series.by_lane(lasts[name]) for name, series in self.estimators.items()})
 
     def awaiting(self) -> str:
         """What the oldest incomplete step still waits for."""

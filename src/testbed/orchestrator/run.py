@@ -17,6 +17,8 @@ from testbed.channel.real.check import check_links
 from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.interrupts import Interrupts, noted
+from testbed.orchestrator.lanes_file import NAME as LANES
+from testbed.orchestrator.lanes_file import LaneFigures, write_lanes
 from testbed.orchestrator.outcome import summarise
 from testbed.orchestrator.preflight import check_estimators, check_processes, prepare_folder
 from testbed.orchestrator.recorder import Recorder
@@ -218,7 +220,7 @@ class Run:
         else:
             status, reason = "complete", None
         summary = summarise(conductor, status=status, reason=reason, timing=timing)
-        write_results(self._out, summary, self._setup.scenario)
+        write_results(self._out, summary, self._setup.scenario, conductor.collector.by_lane())
         return summary
 
 
@@ -232,14 +234,15 @@ def _drain(network: MemoryNetwork, until: Callable[[], bool]) -> None:
             continue
 
 
-def write_results(out: Path, summary: Summary, scenario: Scenario) -> None:
-    """scenario.toml, summary.json and report.html. Raises RunFailed where the disk refuses."""
+def write_results(out: Path, summary: Summary, scenario: Scenario, lanes: LaneFigures) -> None:
+    """scenario.toml, summary.json, lanes.npz and report.html. Raises RunFailed where the disk refuses."""
     from testbed.orchestrator.report import write_report
 
     toml = to_toml(scenario)
     try:
         (out / "scenario.toml").write_text(toml)
         write_summary(out / "summary.json", summary)
+        write_lanes(out / LANES, lanes)
         write_report(out / "report.html", summary, toml)
     except OSError as error:
         raise RunFailed(f"cannot write the results into {out}: {error.strerror}") from None
