@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
-from testbed.scenario import FeedbackInput, Scenario, Transport, parse_scenario, to_toml
+from testbed.scenario import ClosedLoop, Scenario, Transport, parse_scenario, to_toml
 from testbed.wire.codec import Sizes
 from testbed.wire.node import Node
 
@@ -40,7 +40,7 @@ class Setup:
 
     @property
     def closed_loop(self) -> bool:
-        return isinstance(self.scenario.input, FeedbackInput)
+        return isinstance(self.scenario.input, ClosedLoop)
 
     @cached_property
     def window(self) -> int:
