@@ -326,7 +326,7 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"input": {"kind": "exp"}},
-        "input.kind: got 'exp'; allowed: constant, exponential, sine, uniform, table, feedback; "
+        "input.kind: got 'exp'; allowed: constant, exponential, sine, uniform, table, feedback, lqg, pid, python; "
         "did you mean 'exponential'?",
     ),
     (

@@ -13,13 +13,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from testbed.channel.service import is_timed
 from testbed.channel.service import role_of as link_role
+from testbed.control.service import ROLE as CONTROLLER
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.bounds_service import ROLE as BOUNDS
 from testbed.estimator.service import role_of as estimator_role
 from testbed.orchestrator.collect import Collector
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.summary import Happened
-from testbed.plant.controller import ROLE as CONTROLLER
 from testbed.plant.service import ROLE as PLANT
 from testbed.scenario.changes import in_turn
 from testbed.wire.bus import Bus

@@ -17,7 +17,7 @@ from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.interrupts import Interrupts, noted
 from testbed.orchestrator.outcome import summarise
-from testbed.orchestrator.preflight import check_estimators, prepare_folder
+from testbed.orchestrator.preflight import check_parts, prepare_folder
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.roles import RoleSpec, roles_of
 from testbed.orchestrator.running import published
@@ -52,7 +52,7 @@ class Run:
         self, scenario: Scenario, out: Path, *, progress: Progress = _no_progress, say: Callable[[str], None] = _silent
     ) -> None:
         """Raises UsageError where the scenario cannot run or the folder cannot be written, before anything starts."""
-        check_estimators(scenario)
+        check_parts(scenario)
         prepare_folder(out)
         self._out, self._progress, self._say = out, progress, say
         self._setup = Setup(secrets.token_hex(6), scenario)

@@ -11,7 +11,8 @@ RELATIVE_TOLERANCE = 1e-9
 def check_symmetric(name: str, matrix: Matrix, wanted: int, why: str, *, definite: bool = False, at: str = "") -> None:
     """Check a covariance: `wanted` × `wanted`, symmetric, positive semi-definite (or, if `definite`, definite).
 
-    `why` says where the wanted size comes from, `at` where below the value under validation it is. Raises a problem of validation; the matrix is not changed.
+    `why` says where the wanted size comes from, `at` where below the value under validation the matrix is. Raises a
+    problem of validation; the matrix is not changed.
     """
     rows, columns = size(matrix)
     if (rows, columns) != (wanted, wanted):

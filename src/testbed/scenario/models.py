@@ -80,7 +80,7 @@ class Scenario(Part):
 
     @field_validator("estimators")
     @classmethod
-    def _check_estimators(cls, specs: tuple[EstimatorSpec, ...], info: ValidationInfo) -> tuple[EstimatorSpec, ...]:
+    def _check_parts(cls, specs: tuple[EstimatorSpec, ...], info: ValidationInfo) -> tuple[EstimatorSpec, ...]:
         names: set[str] = set()
         for i, spec in enumerate(specs):
             if spec.name in names:
