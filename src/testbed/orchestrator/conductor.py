@@ -161,7 +161,8 @@ class Conductor:
         node, keys, scenario = self.node, self.node.keys, self.setup.scenario
         for role in self._roles:
             node.on(keys.status(role), Status, role, partial(self._status, role))
-        node.on(keys.truth, Truth, PLANT, self._truth)
+        needs = ("applied",) if self.setup.costs_input else ()
+        node.on(keys.truth, Truth, PLANT, self._truth, needs=needs)
         for spec in scenario.estimators:
             take = partial(self._estimate, spec.name, f"estimate/{spec.name}")
             node.on(keys.estimate(spec.name), EstimateMessage, estimator_role(spec.name), take, last=spec.until)

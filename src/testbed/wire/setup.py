@@ -91,6 +91,11 @@ class Setup:
         s = self.scenario
         return s.links.ack.mode != "none" or s.record != "none" or any(e.acks == "perfect" for e in s.estimators)
 
+    @property
+    def costs_input(self) -> bool:
+        """Whether the collector needs the input that was applied."""
+        return self.scenario.cost is not None and self.sizes.q > 0
+
     def to_json(self) -> bytes:
         return json.dumps({"run": self.run, "scenario": to_toml(self.scenario)}).encode()
 

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 
 from testbed.orchestrator.report import csv_data, svg, text
 from testbed.orchestrator.report.derived import common_band, settled
-from testbed.orchestrator.report.figures import axes, covariance, excess, links, nees
+from testbed.orchestrator.report.figures import axes, cost, covariance, excess, links, nees
 from testbed.orchestrator.report.figures.ratio import ratios
 from testbed.orchestrator.report.link_model import Expected, expected_links
-from testbed.orchestrator.summary import Summary
+from testbed.orchestrator.summary import CostFigures, Summary
 
 _ENVIRONMENT = jinja2.Environment(
     loader=jinja2.PackageLoader("testbed.orchestrator.report"),
@@ -84,6 +84,13 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
             "Squared error less claimed covariance along the steps",
         ),
         (
+            "cost",
+            ran and summary.cost is not None,
+            lambda: cost.draw(_given(summary.cost), summary.completed_steps),
+            lambda: csv_data.cost_csv(_given(summary.cost), summary.completed_steps),
+            "Quadratic cost along the steps",
+        ),
+        (
             "links",
             any(link.sent for link in summary.links.values()),
             lambda: links.draw(summary, expected),
@@ -96,6 +103,11 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
         name: _page_figure(number, name, draw, numbers(), label)
         for number, (name, _, draw, numbers, label) in enumerate(shown, start=1)
     }
+
+
+def _given(costs: CostFigures | None) -> CostFigures:
+    assert costs is not None
+    return costs
 
 
 def _page_figure(number: int, name: str, draw: Callable[[], Figure], numbers: str, label: str) -> PageFigure:
