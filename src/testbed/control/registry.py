@@ -84,6 +84,8 @@ def checked_step(controller: Controller, k: int, x_hat: Floats, P: Floats, q: in
         text = " ".join(str(error).split())
         raise UsageError(f"the controller failed at step {k}: {type(error).__name__}: {text}") from None
     expected = (len(x_hat), q)
+    if u is None:
+        raise UsageError(f"the controller returned nothing at step {k}; needed: u of the shape {expected}")
     if given.shape != expected:
         raise UsageError(f"the controller returned the shape {given.shape} at step {k}; allowed: {expected}")
     if not np.isfinite(given).all():
