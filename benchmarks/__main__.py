@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import codec, estimators, lanes, lockstep, streaming
+from benchmarks import codec, estimators, lanes, links, lockstep, streaming
 from benchmarks.figures import machine
 
 BENCHMARKS = {
@@ -18,6 +18,7 @@ BENCHMARKS = {
     "streaming": streaming.run,
     "lanes": lanes.run,
     "estimators": estimators.run,
+    "links": links.run,
 }
 
 

@@ -1,4 +1,4 @@
-"""Write the pages of the reference that follow from the code: scenario, messages, commands, conformance, summary.
+"""Write the pages of the reference that follow from the code: scenario, presets, messages, commands, summary and so on.
 
 python docs/generate.py            write them
 python docs/generate.py --check    exit code 1 if one is not up to date
@@ -17,6 +17,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
+from testbed.cli.link_presets import lines_of
 from testbed.cli.main import app
 from testbed.conformance.form import ROUNDING
 from testbed.conformance.kit import CHECKS, CLAIMS
@@ -24,6 +25,7 @@ from testbed.conformance.theory import EXACT, LOST, LOST_BLIND, NEES, SHORTFALL
 from testbed.estimator.registry import kinds
 from testbed.orchestrator.summary import summary_json_schema
 from testbed.scenario import scenario_json_schema
+from testbed.scenario.presets import presets
 from testbed.wire.asyncapi import asyncapi
 from testbed.wire.messages import messages_json_schema
 
@@ -223,11 +225,33 @@ def conformance_page() -> str:
     )
 
 
+def presets_page() -> str:
+    sections = []
+    for name, preset in presets().items():
+        rows = [("source", preset.source), ("confirmed", preset.confirmed)]
+        rows += [("caveat", text) for text in preset.caveats] + [("assumed", text) for text in preset.assumed]
+        keys = "\n".join(lines_of(preset)).replace("\n# down", "\n```\n\n```toml\n# down")
+        sections.append(f"## `{name}`\n\n{preset.title}.\n\n```toml\n{keys}\n```\n\n{_table(('', ''), rows)}")
+    return _page(
+        "Link presets",
+        'Named links, from what others measured or calibrated. `preset = "NAME"` in a `[links.X]` table stands for the '
+        "keys below; other keys of the table replace its own, each as a whole. Where the directions differ, up is the "
+        "way from the end device into the network, down the way back. `testbed link presets` prints the same.\n\n"
+        "No preset is your network: losses come in bursts that two states do not describe well on Wi-Fi, and of 38 "
+        "segments of Internet paths independent losses fitted 7 and two states 10 (M. Yajnik et al.: Measurement and "
+        "modelling of the temporal dependence in packet loss. INFOCOM 1999; second hand). Measure your own and "
+        "[fit it](../how-to/fit.md). There is none for 4G with bursts, because no published chain with its source was "
+        "found; and none by the correlation of `tc netem`, whose losses are not the asked-for share.",
+        sections,
+    )
+
+
 PAGE_MAKERS: dict[str, Callable[[], str]] = {
     "scenario.md": scenario_page,
     "summary.md": summary_page,
     "messages.md": messages_page,
     "commands.md": commands_page,
+    "presets.md": presets_page,
     "conformance.md": conformance_page,
 }
 

@@ -27,8 +27,12 @@ C = [[1.0]]
 Q = [[1.0]]
 R = [[1.0]]
 """
+_NAMESPACES = ("kernel-links",)
+"""Pages that make network namespaces."""
 RUNNABLE = [
-    page for page in PAGES if any(b.directive.startswith(("run", "file", "copy", "part")) for b in blocks_of(page))
+    pytest.param(page, marks=[pytest.mark.root] if page.stem in _NAMESPACES else [])
+    for page in PAGES
+    if any(b.directive.startswith(("run", "file", "copy", "part")) for b in blocks_of(page))
 ]
 
 

@@ -81,13 +81,15 @@ Recorded = dict[str, dict[str, NDArray[Any]]]
 
 
 def recorded(out: Path, lanes: int, steps: int) -> Recorded:
-    """topic → array → values of shape (steps, lanes, …), steps in order.
+    """topic → array → values of shape (steps, lanes, …), steps in order; less what came late (see ``late_ones``).
 
     Zero where a link delivered nothing, as a packet that arrives in some lanes has it; NaN where nothing was published.
     """
     pieces: dict[tuple[str, str], list[tuple[int, int, NDArray[Any]]]] = defaultdict(list)
     for topic, packet, arrays in read_recording(out / "recording.mcap"):
         for name, array in arrays.items():
+            if name.startswith("late_"):
+                continue
             pieces[topic, name].append((packet.step - packet.FIRST_STEP, packet.lane, array))
     result: Recorded = defaultdict(dict)
     for (topic, name), parts in pieces.items():
@@ -97,6 +99,17 @@ def recorded(out: Path, lanes: int, steps: int) -> Recorded:
             whole[step, lane : lane + len(array)] = array
         result[topic][name] = whole
     return dict(result)
+
+
+def late_ones(out: Path, topic: str, content: str) -> list[tuple[int, int, int, Any]]:
+    """(step in which it came, step that it belongs to, lane, content) of what came late, sorted by the first three."""
+    found = []
+    for name, packet, arrays in read_recording(out / "recording.mcap"):
+        if name == topic and "late_step" in arrays:
+            for row, place in np.argwhere(arrays["late_mask"]):
+                of = int(arrays["late_step"][row, place])
+                found.append((packet.step, of, packet.lane + int(row), arrays[f"late_{content}"][row, place].tolist()))
+    return sorted(found, key=lambda one: one[:3])
 
 
 def written(out: Path) -> dict[str, Any]:

@@ -13,20 +13,25 @@ from testbed.channel.gilbert_elliott import GilbertElliott
 from testbed.channel.hidden import Hidden, HiddenChain
 from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain, LossCounts
+from testbed.channel.packets import packet_bytes
 from testbed.channel.steps import SteppedLink
 from testbed.numerics.lanes import Floats
-from testbed.scenario import ScriptedLoss, TraceLoss
+from testbed.scenario import Scenario, ScriptedLoss, TraceLoss
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.impairments import ConstantDelay
 from testbed.scenario.links import SteppedImpairments
 
 SAMPLED = 20_000
 _SEED = 20_000
-_BYTES = 256
 
 
-def law_in_steps(link: SteppedImpairments, period_ns: int) -> LossModel:
-    """The losses of a link as they are seen from step to step, a packet a period.
+def law_of_link(scenario: Scenario, link: str) -> LossModel:
+    """The losses of a link of a scenario as they are seen from step to step."""
+    return law_in_steps(getattr(scenario.links, link), scenario.clock.period_ns, packet_bytes(scenario, link))
+
+
+def law_in_steps(link: SteppedImpairments, period_ns: int, size: int) -> LossModel:
+    """The losses of a link as they are seen from step to step, a packet of ``size`` bytes a period.
 
     ``assumed`` where it is given. Otherwise exact, but for a clock whose slots do not divide the period (there, the
     mean over their phases), where packets do not depend on each other but through the chain; with a bottleneck,
@@ -40,7 +45,7 @@ def law_in_steps(link: SteppedImpairments, period_ns: int) -> LossModel:
         return chain_of(link.loss)
     if has_formula(link):
         return _exact(link, period_ns)
-    return _sampled(link, period_ns)
+    return _sampled(link, period_ns, size)
 
 
 def has_formula(link: SteppedImpairments) -> bool:
@@ -102,9 +107,9 @@ def _arrives_in_time(link: SteppedImpairments, deadline_ns: int) -> float:
 
 
 @lru_cache(maxsize=16)
-def _sampled(link: SteppedImpairments, period_ns: int) -> Chain:
+def _sampled(link: SteppedImpairments, period_ns: int, size: int) -> Chain:
     carriers = carriers_of(link, _SEED, "law", 0, 1)
-    stepped, counts = SteppedLink(carriers, _BYTES, period_ns, link.deadline_ns(period_ns)), LossCounts()
+    stepped, counts = SteppedLink(carriers, size, period_ns, link.deadline_ns(period_ns)), LossCounts()
     for number in range(SAMPLED):
         counts.count(0, bool(stepped.send(number).in_time[0]))
     (bad, recovered), (failed, good) = counts.transitions

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,13 @@ from typing import Any
 from testbed.channel.chains import chain_of
 from testbed.channel.law import LossModel
 from testbed.channel.loss import LossCounts
+from testbed.channel.packets import packet_bytes
 from testbed.channel.pipeline import Pipeline
-from testbed.channel.service import FIRST_STEP, loss_of, packet_bytes, role_of
+from testbed.channel.service import FIRST_STEP, loss_of, role_of
 from testbed.scenario import Scenario
 from testbed.scenario.changes import changed
 from testbed.scenario.links import SteppedImpairments
-from testbed.scenario.trace_file import HEADER
+from testbed.scenario.trace_file import Row, write_rows
 from testbed.wire.keys import LinkName
 
 
@@ -23,7 +23,7 @@ from testbed.wire.keys import LinkName
 class Trace:
     """Packets in the order of delivery, lost ones where they were sent: (seq, sent_ns, delivered_ns or None)."""
 
-    rows: list[tuple[int, int, int | None]]
+    rows: list[Row]
     counts: LossCounts
     losses: LossModel | None
     """The model that the figures are compared with; None where more than its losses decides, or where it changes."""
@@ -68,7 +68,4 @@ def sample_trace(scenario: Scenario, link: LinkName, number: int, *, seed: int, 
 
 def write_trace(path: Path, trace: Trace) -> None:
     """Write TRACE.csv. Raises OSError."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(HEADER)
-        writer.writerows(("" if field is None else field for field in row) for row in trace.rows)
+    write_rows(path, trace.rows)

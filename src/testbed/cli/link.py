@@ -5,14 +5,22 @@ from __future__ import annotations
 import json as json_format
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import Annotated
 
 import typer
 
-from testbed.errors import UsageError, did_you_mean
-from testbed.wire.keys import LinkName
+from testbed.cli import link_doctor, link_hosts, link_relay
+from testbed.cli.link_import import import_
+from testbed.cli.link_names import link_name
+from testbed.cli.link_presets import presets
+from testbed.cli.link_report import report
+from testbed.errors import UsageError
 
 app = typer.Typer(help="Look at one link: of a scenario, or of a trace.", rich_markup_mode=None)
+
+app.command("import")(import_)
+app.command()(presets)
+app.command()(report)
 
 _LANE_MAX = 2**31 - 2  # the last lane of the largest scenario
 
@@ -41,7 +49,7 @@ def sample(
     from testbed.scenario import load_scenario
 
     loaded = load_scenario(scenario)
-    link = _link(name)
+    link = link_name(name)
     if lane > _LANE_MAX:
         raise UsageError(f"--lane {lane}: allowed: 0 … {_LANE_MAX}")
     if link == "ack" and loaded.links.ack.mode == "none":
@@ -107,16 +115,15 @@ def set_(
     from testbed.scenario.changes import parse_setting, together
 
     change = together([parse_setting(text) for text in settings])
-    answer = ask(run, {"link": _link(name), "set": change})
+    answer = ask(run, {"link": link_name(name), "set": change})
     typer.echo(f"{name}: from step {answer['step']} on")
-
-
-def _link(name: str) -> LinkName:
-    names = get_args(LinkName)
-    if name not in names:
-        raise UsageError(f"--link {name}: no such link; allowed: {', '.join(names)}{did_you_mean(name, names)}")
-    return cast(LinkName, name)
 
 
 def _shown(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
+
+
+app.command("relay")(link_relay.relay)
+app.command("hosts")(link_hosts.hosts)
+app.command("doctor")(link_doctor.doctor)
+app.command("clean")(link_doctor.clean)

@@ -41,8 +41,9 @@ class _Inputs:
 class Refilter:
     """An estimator with a memory of ``depth`` steps. With depth 0 late observations are counted and not used.
 
-    counters: those of the estimator, and ``refiltered`` (steps run again), ``late_observations`` (used),
-    ``old_observations`` (too old), ``repeated_observations`` (already there), each in lanes but for the first.
+    counters: those of the estimator, and ``refiltered`` (steps run again, from what was late in the
+    lane on), ``late_observations`` (used), ``old_observations`` (too old), ``repeated_observations`` (already there),
+    each over all lanes.
     """
 
     def __init__(self, estimator: Estimator, depth: int) -> None:
@@ -78,8 +79,10 @@ class Refilter:
             return self.estimator.step(u, y, arrived, acks)
         kept = [ack for ack in acks if self._remembered(ack.j + 1) and np.any(ack.known)]
         others = [ack for ack in acks if not self._remembered(ack.j + 1)]
-        again = min([*map(self._observe, late), *map(self._acknowledge, kept)], default=self._k + 1)
+        news = [*map(self._observe, late), *map(self._acknowledge, kept)]
+        again = min((step for step, _ in news), default=self._k + 1)
         if again <= self._k:
+            self._count_rerun(news)
             self._rerun(again)
         self._k += 1
         self._inputs[self._k] = _Inputs(np.array(u), np.array(y), np.array(arrived, dtype=np.bool_), others)
@@ -90,30 +93,37 @@ class Refilter:
     def _remembered(self, step: int) -> bool:
         return max(1, self._k + 1 - self._depth) <= step <= self._k
 
-    def _observe(self, late: LateObservation) -> int:
-        """Note a late observation; the step from which on it matters."""
+    def _observe(self, late: LateObservation) -> tuple[int, NDArray[np.bool_]]:
+        """Note a late observation; the step from which on it matters, and the lanes."""
         arrived = np.asarray(late.arrived, dtype=np.bool_)
         if not self._remembered(late.j):
             self._count("old_observations", arrived)
-            return self._k + 1
+            return self._k + 1, arrived
         known = self._inputs[late.j]
         fresh = arrived & ~known.arrived
         self._count("repeated_observations", arrived & known.arrived)
         if not fresh.any():
-            return self._k + 1
+            return self._k + 1, fresh
         self._count("late_observations", fresh)
         known.y[fresh] = np.asarray(late.y)[fresh]
         known.arrived |= fresh
-        return late.j
+        return late.j, fresh
 
-    def _acknowledge(self, ack: Ack) -> int:
-        """Note a late ACK at the step that its packet moved to; the step from which on it matters."""
+    def _acknowledge(self, ack: Ack) -> tuple[int, NDArray[np.bool_]]:
+        """Note a late ACK at the step that its packet moved to; the step from which on it matters, and the lanes."""
         known = self._inputs[ack.j + 1]
         before = next((other for other in known.acks if other.j == ack.j), ack)
         either = np.asarray(before.known, dtype=np.bool_) | np.asarray(ack.known, dtype=np.bool_)
         whole = Ack(ack.j, np.where(ack.known, ack.nu, before.nu), either)
         known.acks = [other for other in known.acks if other.j != ack.j] + [whole]
-        return ack.j + 1
+        return ack.j + 1, np.asarray(ack.known, dtype=np.bool_)
+
+    def _count_rerun(self, news: list[tuple[int, NDArray[np.bool_]]]) -> None:
+        """In each lane, the steps from the first of what is new in it until now."""
+        first = np.full(len(news[0][1]), self._k + 1)
+        for step, lanes in news:
+            first[lanes] = np.minimum(first[lanes], step)
+        self._own["refiltered"] = self._own.get("refiltered", 0) + int((self._k + 1 - first).sum())
 
     def _rerun(self, first: int) -> None:
         """Go back to the last checkpoint before ``first``, and on to where we were."""
@@ -128,7 +138,6 @@ class Refilter:
         for step in range(begin + 1, reached + 1):
             self._k = step
             self._execute(step)
-        self._own["refiltered"] = self._own.get("refiltered", 0) + reached - begin
 
     def _execute(self, step: int) -> Estimate:
         known = self._inputs[step]

@@ -1,8 +1,8 @@
 """The three links, and what happens to their packets."""
 
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from testbed.scenario.base import Part, problem, shown
@@ -11,6 +11,7 @@ from testbed.scenario.durations import Duration, parse_duration
 from testbed.scenario.impairments import Corrupt, Delay, Duplicate, Rate, Reorder
 from testbed.scenario.loss_laws import LossLaw, NoLoss
 from testbed.scenario.losses import Loss
+from testbed.scenario.presets import presets
 from testbed.scenario.replays import ScriptedLoss, TraceLoss
 
 
@@ -39,8 +40,21 @@ class Impairments(Part):
         return self
 
 
+def _link_schema(schema: dict[str, Any]) -> None:
+    schema["properties"]["preset"] = {
+        "type": "string",
+        "title": "Preset",
+        "enum": list(presets()),
+        "description": "Name of a preset, whose keys hold where the table does not give them; the control link is one "
+        "down, from the network to the device, the others are up.",
+    }
+
+
 class SteppedImpairments(Impairments):
     """A link of a run, whose packets belong to steps."""
+
+    model_config = ConfigDict(json_schema_extra=_link_schema)
+    other_keys: ClassVar[tuple[str, ...]] = ("preset",)
 
     deadline: Duration | None = Field(
         default=None,

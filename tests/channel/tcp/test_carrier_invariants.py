@@ -12,7 +12,7 @@ from channel.scripted import MS, S
 from testbed.channel.pipeline import Pipeline
 from testbed.channel.tcp import TcpCarrier
 from testbed.scenario.carriers import TcpTransport
-from testbed.scenario.links import Impairments
+from testbed.scenario.links import Impairments, SteppedImpairments
 
 PATIENT: dict[str, Any] = {"lease": "1000000 s", "blocked_limit": "1000000 s"}
 
@@ -196,3 +196,19 @@ def test_more_than_a_bottleneck_carries_fills_it_without_time_outs(congestion: s
     assert 0.95 < len(got) * 80_000 / (10 * 5e6 * 1448 / 1500) < 1.0
     assert carrier.as_counters()["recoveries"] > 0
     assert carrier.as_counters()["timeouts"] == 0
+
+
+def test_a_change_reaches_both_directions() -> None:
+    slow, slower = ({"kind": "constant", "by": f"{by} ms"} for by in (10, 30))
+    for back, acked_ms in ((None, 60), ({"delay": slow}, 40)):
+        link = Impairments.model_validate({"delay": slow})
+        pipelines = Pipeline(link, 1, "forward"), Pipeline(link, 1, "backward")
+        carrier = TcpCarrier(*pipelines, TcpTransport())
+        carrier.change(SteppedImpairments.model_validate({"delay": slower, "transport": {"kind": "tcp"}, "back": back}))
+        carrier.send(0, 64, 0)
+        assert carrier.advance(S) == [(30 * MS, 0)]
+        carrier.send(1, 64, S)
+        carrier.advance(S + acked_ms * MS - 1)
+        assert pipelines[1].books.in_flight == 1
+        carrier.advance(S + acked_ms * MS)
+        assert pipelines[1].books.in_flight == 0

@@ -87,11 +87,11 @@ class TcpCarrier:
         return min(times, default=None)
 
     def change(self, settings: Impairments) -> None:
-        """Other impairments from now on; backwards too, unless the link says what happens there."""
+        """Other impairments from now on: forwards these, backwards those of `back`, or else these too."""
         forward, backward = self._pipelines[:2]
         forward.change(settings)
-        if not isinstance(settings, SteppedImpairments) or settings.back is None:
-            backward.change(settings)
+        back = settings.back if isinstance(settings, SteppedImpairments) else None
+        backward.change(back or settings)
 
     def as_counters(self) -> dict[str, int]:
         """What the connections did so far."""

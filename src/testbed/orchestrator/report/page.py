@@ -3,45 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
-import jinja2
-from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from testbed.orchestrator.report import csv_data, svg, text
+from testbed.orchestrator.report import csv_data, svg
 from testbed.orchestrator.report.derived import common_band, settled
 from testbed.orchestrator.report.figures import axes, cost, covariance, excess, links, nees
 from testbed.orchestrator.report.figures.ratio import ratios
+from testbed.orchestrator.report.html import ENVIRONMENT, PageFigure, page_figure
 from testbed.orchestrator.report.link_model import Expected, expected_links
 from testbed.orchestrator.summary import CostFigures, Summary
-
-_ENVIRONMENT = jinja2.Environment(
-    loader=jinja2.PackageLoader("testbed.orchestrator.report"),
-    autoescape=True,
-    undefined=jinja2.StrictUndefined,
-    trim_blocks=True,
-    lstrip_blocks=True,
-)
-_ENVIRONMENT.filters.update(number=text.number, count=text.count, share=text.share, band=text.band)
-_ENVIRONMENT.globals.update(plus_minus=text.plus_minus, plural=text.plural, steps_range=text.steps)
-
-
-@dataclass(frozen=True)
-class PageFigure:
-    """A figure as the template shows it: inline, and as two downloads."""
-
-    number: int
-    name: str
-    svg: Markup
-    svg_uri: str
-    csv_uri: str
 
 
 def report_html(summary: Summary, scenario_toml: str) -> str:
     """The whole page; see `testbed.orchestrator.report.write_report`."""
     expected = expected_links(summary, scenario_toml)
-    return _ENVIRONMENT.get_template("report.html").render(
+    return ENVIRONMENT.get_template("report.html").render(
         summary=summary,
         scenario_toml=scenario_toml,
         drawn=_figures(summary, expected),
@@ -100,7 +77,7 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
     ]
     shown = [entry for entry in available if entry[1]]
     return {
-        name: _page_figure(number, name, draw, numbers(), label)
+        name: page_figure(number, name, draw, numbers(), label)
         for number, (name, _, draw, numbers, label) in enumerate(shown, start=1)
     }
 
@@ -108,15 +85,3 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
 def _given(costs: CostFigures | None) -> CostFigures:
     assert costs is not None
     return costs
-
-
-def _page_figure(number: int, name: str, draw: Callable[[], Figure], numbers: str, label: str) -> PageFigure:
-    with svg.look():
-        document = svg.svg_text(draw())
-    return PageFigure(
-        number=number,
-        name=name,
-        svg=Markup(svg.inline_svg(document, prefix=f"figure-{name}", label=label)),
-        svg_uri=svg.data_uri(document, "image/svg+xml"),
-        csv_uri=svg.data_uri(numbers, "text/csv"),
-    )

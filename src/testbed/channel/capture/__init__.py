@@ -1,0 +1,1 @@
+"""Traces from elsewhere: captures of packets (pcap, pcapng) and logs of ping. Files in, rows of a trace out."""
