@@ -263,4 +263,5 @@ def test_the_table_has_a_line_for_it(tmp_path: Path) -> None:
     console.print(end_table(summary, tmp_path))
     (line,) = (line for line in console.export_text().splitlines() if line.startswith("cost: "))
     assert "a step" in line
-    assert "(pid on aoe, at a limit in " in line
+    assert summary.controller is not None
+    assert line.endswith(f"(pid on aoe, {summary.controller.counters['saturated']} at a limit)")

@@ -83,7 +83,7 @@ def _cost(summary: Summary, cost: CostFigures) -> Text:
     if controller is None:
         return Text(line)
     saturated = controller.counters.get("saturated", 0)
-    at_limits = f", at a limit in {text.plural(saturated, 'lane-step')}" if saturated else ""
+    at_limits = f", {text.count(saturated)} at a limit" if saturated else ""
     return Text(f"{line} ({controller.kind} on {controller.estimator}{at_limits})")
 
 
