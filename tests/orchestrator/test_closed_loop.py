@@ -34,6 +34,7 @@ class Bang:
         return array_of(self.last, len(x_hat))
 '''
 LQG = {"kind": "lqg", "Qx": [[2.0, 0.1], [0.1, 1.0]], "Ru": [[1.5]]}
+HIDDEN = {"kind": "gilbert-elliott", "to_bad": 0.2, "to_good": 0.3, "loss_good": 0.1, "loss_bad": 0.7}
 KFIO = [{"name": "kfio", "acks": "perfect"}]
 COST = {"Qx": [[1.0, 0.2], [0.2, 2.0]], "Ru": [[0.5]], "terminal": [[7.0, 0.0], [0.0, 7.0]], "reference": [0.5, 0.0]}
 LOOPS: dict[str, dict[str, Any]] = {
@@ -222,6 +223,11 @@ def test_steps_that_were_not_completed_cost_nothing(tmp_path: Path) -> None:
         ({"estimators": [{"name": "pf", "acks": "perfect"}]}, "the x̂ of pf is not known to be"),
         ({"input": {**LQG, "high": 2.0}}, "the input has limits"),
         ({"actuator": {"on_loss": "hold"}}, "the actuator holds"),
+        ({"links": {"control": {"loss": HIDDEN}}}, "the losses have a hidden state"),
+        (
+            {"events": [{"at": 2, "action": "set", "link": "control", "set": {"loss": {"arrival": 0.9}}}]},
+            "the losses of control change",
+        ),
         ({"uncertainty": {"dA": [[[0.1, 0.0], [0.0, 0.0]]], "delta": 1.0}}, "the plant departs from its model"),
     ],
 )
@@ -230,6 +236,23 @@ def test_what_keeps_it_from_being_optimal_is_said(changes: dict[str, Any], reaso
     assert summary.controller is not None
     assert str(summary.controller.statement).startswith("not optimal: ")
     assert reason in str(summary.controller.statement)
+
+
+def test_without_losses_of_control_it_is_optimal_without_acks(tmp_path: Path) -> None:
+    links = {"observation": {"loss": MARKOV}}
+    summary = run(loop("lqg", steps=4, links=links, estimators=[{"name": "ff", "acks": "none"}]), tmp_path)
+    assert summary.controller is not None
+    assert str(summary.controller.statement).startswith("optimal: ")
+
+
+def test_losses_with_a_hidden_state_count_by_their_rate(tmp_path: Path) -> None:
+    """0.4 · 0.7 + 0.6 · 0.1 of the packets are lost in the long run."""
+    gains = []
+    for loss in (HIDDEN, {"kind": "bernoulli", "loss": 0.4 * 0.7 + 0.6 * 0.1}):
+        summary = run(loop("lqg", steps=2, links={"control": {"loss": loss}}), tmp_path)
+        assert summary.controller is not None
+        gains.append(summary.controller.gain)
+    np.testing.assert_allclose(np.array(gains[0]), np.array(gains[1]), rtol=1e-10)
 
 
 def test_losses_that_no_gain_stands_are_refused_before_the_run(tmp_path: Path) -> None:
