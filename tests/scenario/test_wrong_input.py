@@ -488,7 +488,8 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"estimators": [{"name": "oe", "options": {"kind": 3}}]},
-        "estimators[0].options: got the reserved key 'kind'; allowed: any key but name, kind, acks, until, options",
+        "estimators[0].options: got the reserved key 'kind'; allowed: any key but name, kind, acks, until, buffer, "
+        "options",
     ),
     # the rest
     ({"seed": 2**63}, f"seed: got {2**63}; allowed: an integer, 0 … {2**63 - 1}"),

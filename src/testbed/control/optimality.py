@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from testbed.estimator.buffers import acks_of
 from testbed.estimator.registry import model_of
-from testbed.estimator.service import acks_of, spec_of
+from testbed.estimator.service import spec_of
 from testbed.scenario import LqgInput, Scenario
 
 WITH_ACKS = frozenset({"kfio", "oe", "oe-exact", "aoe", "gpb", "gpb1", "gpb2", "imm", "lmmse", "ff", "kf"})

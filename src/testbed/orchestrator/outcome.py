@@ -17,8 +17,9 @@ from testbed.control.optimality import statement
 from testbed.control.registry import lqg_gains
 from testbed.control.service import ROLE as CONTROLLER
 from testbed.estimator.bounds import held_factor
+from testbed.estimator.buffers import acks_of, largest_buffer
 from testbed.estimator.registry import model_of
-from testbed.estimator.service import acks_of, role_of
+from testbed.estimator.service import role_of
 from testbed.numerics.lanes import constant
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import (
@@ -105,7 +106,7 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
 
 def moment_checks(scenario: Scenario) -> list[Check]:
     """Whether the EEC and the variance of its sample mean can be finite."""
-    A, losses = np.array(scenario.system.A), law_of_link(scenario, "observation")
+    A, losses = np.array(scenario.system.A), law_of_link(scenario, "observation", largest_buffer(scenario))
     order, rho, decay = finite_moment_order(A, losses), spectral_radius(A), losses.burst_decay
     hidden = isinstance(losses, Hidden)
     burst = f"θ = {decay:.6g}" if hidden else f"P(arrival after a loss) = {losses.recovery:.6g}"

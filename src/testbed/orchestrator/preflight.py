@@ -6,8 +6,8 @@ from pathlib import Path
 
 from testbed.control.registry import check as check_controller
 from testbed.errors import UsageError
+from testbed.estimator.buffers import acks_of
 from testbed.estimator.registry import check, model_of
-from testbed.estimator.service import acks_of
 from testbed.scenario import Scenario
 
 
