@@ -13,13 +13,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from testbed.channel.real.check import check_link
 from testbed.channel.service import role_of as link_role
+from testbed.control.service import ROLE as CONTROLLER
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.bounds_service import ROLE as BOUNDS
 from testbed.estimator.service import role_of as estimator_role
 from testbed.orchestrator.collect import Collector
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.summary import Happened
-from testbed.plant.controller import ROLE as CONTROLLER
 from testbed.plant.service import ROLE as PLANT
 from testbed.scenario.changes import in_turn
 from testbed.wire.bus import Bus
@@ -162,7 +162,8 @@ class Conductor:
         node, keys, scenario = self.node, self.node.keys, self.setup.scenario
         for role in self._roles:
             node.on(keys.status(role), Status, role, partial(self._status, role))
-        node.on(keys.truth, Truth, PLANT, self._truth)
+        needs = ("applied",) if self.setup.costs_input else ()
+        node.on(keys.truth, Truth, PLANT, self._truth, needs=needs)
         for spec in scenario.estimators:
             take = partial(self._estimate, spec.name, f"estimate/{spec.name}")
             node.on(keys.estimate(spec.name), EstimateMessage, estimator_role(spec.name), take, last=spec.until)

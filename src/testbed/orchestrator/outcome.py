@@ -13,14 +13,21 @@ from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.channel.hidden import Hidden
 from testbed.channel.in_time import law_of_link
+from testbed.control.optimality import statement
+from testbed.control.registry import lqg_gains
+from testbed.control.service import ROLE as CONTROLLER
 from testbed.estimator.bounds import held_factor
 from testbed.estimator.buffers import acks_of, largest_buffer
 from testbed.estimator.registry import model_of
 from testbed.estimator.service import role_of
+from testbed.numerics.lanes import constant
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import (
+    Z_95,
     BoundFigures,
     Check,
+    ControllerFigures,
+    CostFigures,
     EstimatorFigures,
     LinkFigures,
     Summary,
@@ -28,7 +35,7 @@ from testbed.orchestrator.summary import (
     Transitions,
 )
 from testbed.plant.inputs import control_bound
-from testbed.scenario import Scenario
+from testbed.scenario import ClosedLoop, FeedbackInput, LqgInput, Scenario
 from testbed.wire.messages import Status
 from testbed.wire.node import ORCHESTRATOR
 
@@ -63,6 +70,8 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
             "reason": broken or reason,
             "estimators": estimators,
             "bounds": bounds,
+            "controller": _controller(conductor),
+            "cost": _cost(conductor),
             "links": links,
             "events": sorted((e for e in conductor.events if e.step <= collector.completed), key=lambda e: e.step),
             "checks": checks,
@@ -224,6 +233,42 @@ def _estimators(conductor: Conductor) -> dict[str, EstimatorFigures]:
             }
         )
     return out
+
+
+def _controller(conductor: Conductor) -> ControllerFigures | None:
+    scenario, source = conductor.setup.scenario, conductor.setup.scenario.input
+    if not isinstance(source, ClosedLoop):
+        return None
+    gain = source.gain if isinstance(source, FeedbackInput) else None
+    if isinstance(source, LqgInput):
+        gain = constant(lqg_gains(source, model_of(scenario), scenario.steps)[-1])
+    return ControllerFigures(
+        kind=source.kind,
+        estimator=source.estimator,
+        gain=gain,
+        statement=statement(scenario),
+        counters=conductor.reports.get(CONTROLLER, _SILENT).counters,
+    )
+
+
+def _cost(conductor: Conductor) -> CostFigures | None:
+    book, steps = conductor.collector.cost, conductor.collector.completed
+    if book is None:
+        return None
+    figures = {f"{key}_mean": values for key, values in book.series.mean.items()}
+    figures |= {f"{key}_stderr": values for key, values in book.series.stderr.items()}
+    _, total, stderr = book.total()
+    interval = None if total is None or stderr is None else (total - Z_95 * stderr, total + Z_95 * stderr)
+    return CostFigures.model_validate(
+        {
+            **figures,
+            "total": total,
+            "total_stderr": stderr,
+            "total_interval_95": interval,
+            "a_step": None if total is None else total / steps,
+            "a_step_stderr": None if stderr is None else stderr / steps,
+        }
+    )
 
 
 def _bounds(conductor: Conductor) -> BoundFigures | None:

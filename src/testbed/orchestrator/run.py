@@ -20,7 +20,7 @@ from testbed.orchestrator.interrupts import Interrupts, noted
 from testbed.orchestrator.lanes_file import NAME as LANES
 from testbed.orchestrator.lanes_file import LaneFigures, write_lanes
 from testbed.orchestrator.outcome import summarise
-from testbed.orchestrator.preflight import check_estimators, check_processes, prepare_folder
+from testbed.orchestrator.preflight import check_parts, check_processes, prepare_folder
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.roles import RoleSpec, roles_of
 from testbed.orchestrator.running import published
@@ -55,7 +55,7 @@ class Run:
         self, scenario: Scenario, out: Path, *, progress: Progress = _no_progress, say: Callable[[str], None] = _silent
     ) -> None:
         """Raises UsageError where the scenario cannot run or the folder cannot be written, before anything starts."""
-        check_estimators(scenario)
+        check_parts(scenario)
         check_links(scenario)
         prepare_folder(out)
         self._out, self._progress, self._say = out, progress, say

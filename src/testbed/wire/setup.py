@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
-from testbed.scenario import FeedbackInput, Scenario, Transport, parse_scenario, to_toml
+from testbed.scenario import ClosedLoop, Scenario, Transport, parse_scenario, to_toml
 from testbed.scenario.backend import real_links
 from testbed.wire.codec import Sizes
 from testbed.wire.node import Node
@@ -42,7 +42,7 @@ class Setup:
 
     @property
     def closed_loop(self) -> bool:
-        return isinstance(self.scenario.input, FeedbackInput)
+        return isinstance(self.scenario.input, ClosedLoop)
 
     @cached_property
     def window(self) -> int:
@@ -97,6 +97,11 @@ class Setup:
         """Whether anybody takes the plant's ACKs: an ack link, an estimator that gets them directly, the recording."""
         s = self.scenario
         return s.links.ack.mode != "none" or s.record != "none" or any(e.acks == "perfect" for e in s.estimators)
+
+    @property
+    def costs_input(self) -> bool:
+        """Whether the collector needs the input that was applied."""
+        return self.scenario.cost is not None and self.sizes.q > 0
 
     def to_json(self) -> bytes:
         return json.dumps({"run": self.run, "scenario": to_toml(self.scenario)}).encode()

@@ -10,9 +10,9 @@ from typing import Any
 from testbed.errors import UsageError
 from testbed.orchestrator.lanes_file import NAME, LaneFigures, read_lanes
 from testbed.orchestrator.summary import Summary, read_summary
-from testbed.scenario import Scenario, load_scenario, to_dict
+from testbed.scenario import ClosedLoop, Scenario, load_scenario, to_dict
 
-_NOISE = ("seed", "lanes", "steps", "system", "uncertainty")
+_NOISE = ("seed", "lanes", "steps", "system", "uncertainty", "cost")
 _COURSE = ("input", "actuator", "links", "clock", "events")
 
 
@@ -74,7 +74,7 @@ def besides(one: RunFigures, other: RunFigures) -> list[str]:
 
 
 def _closed(run: RunFigures) -> bool:
-    return hasattr(run.scenario.input, "estimator")
+    return isinstance(run.scenario.input, ClosedLoop)
 
 
 def _differing(one: RunFigures, other: RunFigures, keys: Sequence[str]) -> list[str]:
