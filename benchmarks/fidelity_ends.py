@@ -73,7 +73,7 @@ def send(endpoint: str, messages: int, size: int, period_ns: int) -> None:
     """Prints how late the puts began, ms, and whether it has real-time priority; stays until its input ends."""
     behind_ns = []
     with _session("connect", endpoint) as session:
-        publisher = session.declare_publisher(_KEY, congestion_control=zenoh.CongestionControl.BLOCK)
+        publisher: Any = session.declare_publisher(_KEY, congestion_control=zenoh.CongestionControl.BLOCK)
         while not publisher.matching_status.matching:
             time.sleep(_NAP_S)
         print("ready", flush=True)

@@ -45,7 +45,7 @@ def through_kernel(cell: Cell, seconds: float, stop: threading.Event) -> Seen:
             receiver = _start(running, hosts.b, ["receive", endpoint, str(messages)])
             traffic = ["--size", str(cell.size), "--period-ns", str(cell.period_ns)]
             sender = _start(running, hosts.a, ["send", endpoint, str(messages), *traffic])
-            notes = {"congestion": _congestion(hosts)} if cell.transport == "tcp" else {}
+            congestion = _congestion(hosts) if cell.transport == "tcp" else ""
             before = _timeouts(hosts)
             begin_ns = time.monotonic_ns() + round(_LEAD_S * 1e9)
             until_ns = begin_ns + round((seconds + cell.drain_s) * 1e9)
@@ -63,8 +63,8 @@ def through_kernel(cell: Cell, seconds: float, stop: threading.Event) -> Seen:
             over.cancel()
             _kill(running)
     numbers = np.array(got["numbers"], dtype=np.int64)
-    at_ms = (np.array(got["at_ns"], dtype=np.int64) - begin_ns) * 1e-6
-    notes |= {**sent, "overdue": books["overdue"], "overrun": books["overrun"]}
+    at_ms = (np.array(got["at_ns"], dtype=np.int64) - begin_ns).astype(np.float64) * 1e-6
+    notes = {**sent, "congestion": congestion, "overdue": books["overdue"], "overrun": books["overrun"]}
     return Seen(messages, cell.period_ns * 1e-6, numbers, at_ms, timeouts, notes)
 
 

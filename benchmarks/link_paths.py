@@ -111,7 +111,6 @@ class Kernel:
     @contextmanager
     def _hosts() -> Iterator[Any]:
         from testbed.channel.kernel.hosts import Hosts, Way
-
         from testbed.scenario.links import Impairments
 
         clean = Impairments()
