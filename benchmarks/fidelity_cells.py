@@ -85,6 +85,8 @@ class Seen:
     numbers: NDArray[np.int64]
     at_ms: NDArray[np.float64]
     timeouts: int = 0
+    back: float = 0.0
+    """Packets sent back for each one sent forwards."""
     notes: dict[str, Any] = field(default_factory=dict)
 
     @property

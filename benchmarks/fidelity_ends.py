@@ -40,6 +40,7 @@ def _session(side: str, endpoint: str) -> Iterator[zenoh.Session]:
         f"{side}/endpoints": [endpoint],
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,  # else large messages do not take the link
     }
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))

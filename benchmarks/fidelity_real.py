@@ -33,10 +33,10 @@ def through_kernel(cell: Cell, seconds: float, stop: threading.Event) -> Seen:
     clean = Impairments.model_validate(delay)
     lossy = Impairments.model_validate(cell.impairments())
     component = f"link.{cell.name.replace(' ', '-')}"
-    ways = [Way(clean, f"{component}.{direction}") for direction in ("forward", "backward")]
+    there, back = (Way(clean, f"{component}.{direction}") for direction in ("forward", "backward"))
     messages = cell.messages(seconds)
     running: list[subprocess.Popen[Any]] = []
-    with Hosts(*ways, seed=1, congestion=CONGESTION) as hosts:
+    with Hosts(there, back, seed=1, congestion=CONGESTION) as hosts:
         over = threading.Timer(_OPEN_S + seconds + cell.drain_s + _SLACK_S, _kill, [running])
         over.daemon = True
         over.start()
@@ -46,7 +46,7 @@ def through_kernel(cell: Cell, seconds: float, stop: threading.Event) -> Seen:
             traffic = ["--size", str(cell.size), "--period-ns", str(cell.period_ns)]
             sender = _start(running, hosts.a, ["send", endpoint, str(messages), *traffic])
             congestion = _congestion(hosts) if cell.transport == "tcp" else ""
-            before = _timeouts(hosts)
+            before, first = _timeouts(hosts), hosts.books()
             begin_ns = time.monotonic_ns() + round(_LEAD_S * 1e9)
             until_ns = begin_ns + round((seconds + cell.drain_s) * 1e9)
             for process in running:
@@ -57,15 +57,21 @@ def through_kernel(cell: Cell, seconds: float, stop: threading.Event) -> Seen:
             if cell.transport == "tcp":
                 hosts.change("backward", lossy)
             sent, got = (_heard(process) for process in (sender, receiver))
-            books = hosts.books()["forward"]
+            ways = hosts.books()
             timeouts = _timeouts(hosts) - before
         finally:
             over.cancel()
             _kill(running)
     numbers = np.array(got["numbers"], dtype=np.int64)
     at_ms = (np.array(got["at_ns"], dtype=np.int64) - begin_ns).astype(np.float64) * 1e-6
-    notes = {**sent, "congestion": congestion, "overdue": books["overdue"], "overrun": books["overrun"]}
-    return Seen(messages, cell.period_ns * 1e-6, numbers, at_ms, timeouts, notes)
+    notes = {
+        **sent,
+        "congestion": congestion,
+        "overdue": sum(way["overdue"] for way in ways.values()),
+        "overrun": sum(way["overrun"] for way in ways.values()),
+    }
+    packets = [ways[way]["sent"] - first[way]["sent"] for way in ("forward", "backward")]
+    return Seen(messages, cell.period_ns * 1e-6, numbers, at_ms, timeouts, packets[1] / packets[0], notes)
 
 
 def _start(running: list[subprocess.Popen[Any]], host: Host, arguments: list[str]) -> subprocess.Popen[Any]:

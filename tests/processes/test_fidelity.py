@@ -60,7 +60,8 @@ def test_losses_that_are_independent_have_the_binomial_law() -> None:
 )
 def test_an_outage_is_a_run_of_messages_that_did_not_arrive(arrived: list[int], outages: int) -> None:
     numbers = np.array(arrived, dtype=np.int64)
-    assert Seen(4, 10.0, numbers, 10.0 * numbers + 1.0).outages == outages
+    at_ms = (10 * numbers + 1).astype(np.float64)
+    assert Seen(4, 10.0, numbers, at_ms).outages == outages
 
 
 def test_cells_have_names_of_their_own() -> None:
