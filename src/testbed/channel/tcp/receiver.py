@@ -16,6 +16,10 @@ class Receiver:
     A segment out of order, one that came before and one that fills a gap are acknowledged at once (RFC 5681, 4.2).
     Others, with ``delay_ns`` = 0, too: Linux does that when the application reads each small segment at once and sends
     nothing back. Else every second one is, or what is there when ``delay_ns`` is over.
+
+    The time stamp that is echoed is the latest of a segment that touches the last acknowledgement (RFC 7323, 4.3). One
+    that ends before it is refused unread (RFC 9293, 3.10.7.4): its acknowledgement has an older stamp, and the sender
+    measures a round trip as long as the silence before it.
     """
 
     def __init__(self, delay_ns: int, acknowledge: Callable[[Ack, int], None]) -> None:
@@ -32,7 +36,7 @@ class Receiver:
         """Take in a segment; True if more of the stream is in order now."""
         start, end, stamp = data
         expected = self.expected
-        if start <= self._told and stamp > self._stamp:
+        if start <= self._told <= end and stamp > self._stamp:
             self._stamp = stamp
         duplicate: tuple[int, int] | None = None
         if start > expected:
