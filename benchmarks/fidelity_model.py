@@ -18,11 +18,15 @@ from testbed.scenario.carriers import UdpTransport
 from testbed.scenario.links import Impairments, SteppedImpairments
 
 _NEGLIGIBLE = 1e-15
+_TRANSPORTS = {
+    "tcp": {"kind": "tcp", "congestion": "cubic", "delayed_ack": "40 ms", "keep_alive": "2.5 s"},  # those of zenoh
+    "udp": {"kind": "udp"},
+}
 
 
 def modelled(cell: Cell, seconds: float, offset_ms: float, seed: int) -> Seen:
     """``offset_ms`` is what the real path adds to the delay."""
-    keys = cell.impairments(offset_ms) | {"transport": {"kind": cell.transport}}
+    keys = cell.impairments(offset_ms) | {"transport": _TRANSPORTS[cell.transport]}
     link = SteppedImpairments.model_validate(keys)
     carrier = carriers_of(link, seed, "link.fidelity", 0, 1)[0]
     messages, period_ns = cell.messages(seconds), cell.period_ns

@@ -44,6 +44,12 @@ class TcpTransport(Part):
         description="How long an acknowledgement may wait for a second segment; 0: each segment is acknowledged at "
         "once, as Linux does when the application reads it at once and sends nothing back.",
     )
+    keep_alive: DurationOrZero = Field(
+        default="0 s",
+        description="With delayed_ack: how often the receiving end sends something of its own. Linux delays "
+        "acknowledgements only from then on until a segment comes twice; 0: it always does. For zenoh, "
+        "delayed_ack = '40 ms' and keep_alive = '2.5 s'.",
+    )
     framing_bytes: int = Field(
         default=13, ge=0, le=65535, description="Bytes that the application's protocol adds to a message; zenoh: 13."
     )
