@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from testbed.scenario.base import COUNT_MAX, Count, Part, problem, shown
-from testbed.scenario.durations import Duration, DurationOrZero
+from testbed.scenario.durations import Duration, DurationOrZero, parse_duration
 
 UDP_HEADER_BYTES = 8
 IP_HEADER_BYTES = 20
@@ -78,6 +78,12 @@ class TcpTransport(Part):
             raise problem(
                 f"got {shown(self.buffer_bytes)}; allowed: at least mss, which is {shown(self.mss)}", "buffer_bytes"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _delayed_with_keep_alive(self) -> "TcpTransport":
+        if parse_duration(self.keep_alive, zero=True) and not parse_duration(self.delayed_ack, zero=True):
+            raise problem(f"got {shown(self.keep_alive)} without delayed_ack; allowed: only with it", "keep_alive")
         return self
 
 
