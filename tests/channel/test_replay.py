@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from testbed.channel.chains import chain_of
-from testbed.channel.in_time import law_in_steps
+from testbed.channel.in_time import law_of_link
 from testbed.channel.law import law_of
 from testbed.channel.loss import Chain
 from testbed.channel.pipeline import Pipeline
@@ -198,5 +198,5 @@ def test_through_a_bottleneck_the_law_is_that_of_the_assumed_losses() -> None:
         parse_scenario({"system": SYSTEM, "steps": 100, "links": {"observation": {**link, "loss": given_}}})
         for given_ in (loss, {"kind": "markov", "recovery": 0.5, "failure": 0.125})
     )
-    laws = [law_in_steps(at.links.observation, at.clock.period_ns) for at in (replayed, chain)]
+    laws = [law_of_link(at, "observation") for at in (replayed, chain)]
     assert laws[0] == laws[1]

@@ -99,7 +99,9 @@ def check_one_system(seed: int, steps: int) -> float:
     coming: list[tuple[int, int, bool]] = []
     for k in range(1, steps + 1):
         u = rng.normal(size=(1, model.q)) * 2.0
-        delivered = bool(rng.random() < float(model.control.arrival_given(delivered if k > 1 else None)))
+        chain = model.control
+        arrives = chain.start if k == 1 else 1.0 - chain.failure if delivered else chain.recovery
+        delivered = bool(rng.random() < arrives)
         assert model.B is not None
         x = model.A @ x + delivered * (model.B @ u[0]) + rng.multivariate_normal(np.zeros(model.n), model.Q)
         y = (model.C @ x + rng.multivariate_normal(np.zeros(model.p), model.R))[None]

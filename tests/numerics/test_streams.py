@@ -139,3 +139,10 @@ def test_what_is_returned_may_be_changed() -> None:
     row = stream.normals(0)
     row[0] = 1e9
     assert stream.normals(0)[0] != 1e9
+
+
+@given(steps=st.lists(st.integers(0, 2000), min_size=1, max_size=30), width=st.integers(1, 3), lane=st.integers(0, 5))
+@settings(deadline=None, max_examples=40)
+def test_the_first_number_of_a_lane_is_the_first_of_the_uniforms(steps: list[int], width: int, lane: int) -> None:
+    one, other = (Stream(3, "link.test", "loss", width=width, lane=lane, lanes=1) for _ in range(2))
+    assert [one.first(step) for step in steps] == [other.uniforms(step)[0] for step in steps]

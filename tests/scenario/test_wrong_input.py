@@ -414,7 +414,8 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"estimators": [{"name": "oe", "options": {"kind": 3}}]},
-        "estimators[0].options: got the reserved key 'kind'; allowed: any key but name, kind, acks, until, options",
+        "estimators[0].options: got the reserved key 'kind'; allowed: any key but name, kind, acks, until, buffer, "
+        "options",
     ),
     # the rest
     ({"seed": 2**63}, f"seed: got {2**63}; allowed: an integer, 0 … {2**63 - 1}"),
@@ -460,7 +461,7 @@ def test_wrong_value(changes: dict[str, Any], expected: str) -> None:
 def test_an_unknown_key_like_no_other_lists_what_is_allowed() -> None:
     assert message(changed({"zzz": 1})) == (
         "unknown key 'zzz'; allowed: name, steps, lanes, seed, record, bounds, clock, system, uncertainty, "
-        "estimators, actuator, input, links, transport"
+        "estimators, actuator, input, links, transport, events"
     )
 
 

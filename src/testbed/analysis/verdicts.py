@@ -17,10 +17,11 @@ from testbed.analysis.robust_verdicts import robust_figures
 from testbed.analysis.strong import StrongObservability, strong_observability
 from testbed.analysis.structure import Reach, controllability, observability, unstable_eigenvalues
 from testbed.channel.hidden import Hidden
-from testbed.channel.in_time import law_in_steps
+from testbed.channel.in_time import law_of_link
 from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain
 from testbed.estimator.bounds import held_factor
+from testbed.estimator.buffers import largest_buffer
 from testbed.numerics.lanes import Floats
 from testbed.scenario import FeedbackInput, Input, Links, Loss, Scenario
 
@@ -109,9 +110,8 @@ def analyze(scenario: Scenario) -> dict[str, Any]:
 def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
     A = facts.A
     observed, controlled = scenario.links.observation.loss, scenario.links.control.loss
-    period_ns = scenario.clock.period_ns
-    chain = _simplest(law_in_steps(scenario.links.observation, period_ns))
-    in_time = law_in_steps(scenario.links.control, period_ns)
+    chain = _simplest(law_of_link(scenario, "observation", largest_buffer(scenario)))
+    in_time = law_of_link(scenario, "control")
     control = _simplest(in_time)
     verdict = observation_verdict(facts, chain)
     return {

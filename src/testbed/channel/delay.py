@@ -13,6 +13,7 @@ Law = Callable[[float], int]
 """From u, uniform on [0, 1), to ns."""
 
 _HALF = 2.0**-54
+_BELOW_ONE = 1.0 - 2.0**-53
 _STANDARD = NormalDist()
 
 
@@ -40,14 +41,14 @@ def cdf_of(delay: Delay) -> Callable[[int], float]:
         low, high = _ns(delay.low), _ns(delay.high)
         return lambda ns: float(ns >= low) if low == high else min(1.0, max(0.0, (ns - low) / (high - low)))
     if isinstance(delay, NormalDelay):
-        law, least = NormalDist(_ns(delay.mean), _ns(delay.std)), _ns(delay.minimum)
-        below = law.cdf(least)
-        return lambda ns: 0.0 if ns < least else (law.cdf(ns) - below) / (1.0 - below)
+        mean, std, least = _ns(delay.mean), _ns(delay.std), _ns(delay.minimum)
+        above = _below((mean - least) / std)
+        return lambda ns: 0.0 if ns < least else 1.0 - _below((mean - ns) / std) / above
     if isinstance(delay, LogNormalDelay):
         median, sigma, least = _ns(delay.median), delay.sigma, _ns(delay.minimum)
         if sigma == 0.0:
             return lambda ns: float(ns >= least + median)
-        return lambda ns: 0.0 if ns <= least else _STANDARD.cdf(math.log((ns - least) / median) / sigma)
+        return lambda ns: 0.0 if ns <= least else _below(math.log((ns - least) / median) / sigma)
     values = sorted(_values(delay))
     return lambda ns: sum(value <= ns for value in values) / len(values)
 
@@ -56,15 +57,25 @@ def _ns(text: str) -> int:
     return parse_duration(text, zero=True)
 
 
+def _below(z: float) -> float:
+    """P(a standard normal is at most z), to the last digits in both tails."""
+    return 0.5 * math.erfc(-z / math.sqrt(2.0))
+
+
 def _cut_normal(mean: int, std: int, least: int) -> Law:
     """Drawn from the lower tail of the mirrored law: so near 1 a probability has too few digits to be inverted."""
-    inverse, above = _STANDARD.inv_cdf, _STANDARD.cdf((mean - least) / std)
+    inverse, above = _STANDARD.inv_cdf, min(_BELOW_ONE, _below((mean - least) / std))
     return lambda u: max(least, round(mean - std * inverse(above * (1.0 - u - _HALF))))
 
 
 def _log_normal(median: int, sigma: float, least: int) -> Law:
     inverse, exp = _STANDARD.inv_cdf, math.exp
-    return lambda u: least + round(median * exp(sigma * inverse(u + _HALF)))
+
+    def law(u: float) -> int:
+        z = inverse(u + _HALF) if u < 0.5 else -inverse(1.0 - u - _HALF)
+        return least + round(median * exp(sigma * z))
+
+    return law
 
 
 def _values(delay: TableDelay) -> list[int]:

@@ -167,6 +167,5 @@ class GilbertElliottProcess:
         """The fate of packet ``number`` in that state."""
         bad_arrival, good_arrival = self._arrival
         if isinstance(good, bool):
-            (uniform,) = self._drops.uniforms(number)
-            return bool(uniform < (good_arrival if good else bad_arrival))
+            return self._drops.first(number) < (good_arrival if good else bad_arrival)
         return happens(self._drops.words(number)[0], good, bad_arrival, good_arrival)

@@ -6,6 +6,7 @@ A packet meets a state, which decides how likely it is lost; then the chain move
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -212,11 +213,11 @@ class HiddenProcess:
 
     def move(self, number: int) -> State:
         """State ``number``, from the one before."""
-        (point,) = self._states.uniforms(number)
         if self._lanes == 1:
             ends = self._first if self.state is None else self._rows[self.state]
-            self.state = sum(point >= end for end in ends)
+            self.state = bisect_right(ends, self._states.first(number))
             return self.state
+        (point,) = self._states.uniforms(number)
         before, state = self.state, np.zeros(self._lanes, dtype=np.intp)
         for column, end in zip(self._columns, self._first, strict=True):
             state += point >= (end if before is None else column[before])
@@ -226,8 +227,10 @@ class HiddenProcess:
     def fate(self, number: int, state: State) -> Mask:
         """The fate of packet ``number`` in that state."""
         arrival = self._arrival[state]
+        if self._lanes == 1:
+            return bool((self._drops.first(number) if self._drawn else 0.5) < arrival)
         (point,) = self._drops.uniforms(number) if self._drawn else (0.5,)
-        return bool(point < arrival) if self._lanes == 1 else np.asarray(point < arrival)
+        return np.asarray(point < arrival)
 
 
 def _ends(chances: Floats) -> Floats:

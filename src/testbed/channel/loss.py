@@ -95,14 +95,6 @@ class Chain:
         """P(m losses in a row) falls like burst_decay^m."""
         return 1.0 - self.recovery
 
-    def arrival_given(self, last: Mask | None) -> float | np.ndarray:
-        """P(this packet is delivered | the fate of the one before); ``None`` before the first packet."""
-        if last is None:
-            return self.start
-        if isinstance(last, bool):
-            return 1.0 - self.failure if last else self.recovery
-        return np.where(last, 1.0 - self.failure, self.recovery)
-
 
 class LossProcess:
     """Draws the fate of packet 0, 1, 2, … for a block of lanes."""
@@ -113,17 +105,25 @@ class LossProcess:
         self.chain, self._stream, self._lanes = chain, stream, lanes
         prepare(lanes)
         self._last: Mask | None = None
+        self._lossless = chain.never_loses
+        self._start, self._recovery, self._stays = chain.start, chain.recovery, 1.0 - chain.failure
 
     def next(self, number: int) -> Mask:
         """Arrival mask of packet ``number``: a ``bool`` for one lane, else a boolean array of shape (M,)."""
-        if self.chain.never_loses:
-            return True if self._lanes == 1 else np.ones(self._lanes, dtype=np.bool_)
-        if self._lanes > 1 and self._last is not None:
-            recovery, stays = self.chain.recovery, 1.0 - self.chain.failure
-            self._last = happens(self._stream.words(number)[0], self._last, recovery, stays)
-            return self._last
-        (uniform,) = self._stream.uniforms(number)
-        self._last = uniform < self.chain.arrival_given(self._last)
+        last = self._last
+        if self._lanes == 1:
+            if self._lossless:
+                return True
+            chance = self._start if last is None else self._stays if last else self._recovery
+            self._last = fate = self._stream.first(number) < chance
+            return fate
+        if self._lossless:
+            return np.ones(self._lanes, dtype=np.bool_)
+        if last is None:
+            (uniforms,) = self._stream.uniforms(number)
+            self._last = np.asarray(uniforms < self._start)
+        else:
+            self._last = happens(self._stream.words(number)[0], last, self._recovery, self._stays)
         return self._last
 
     @property

@@ -107,18 +107,21 @@ class Pipeline:
         if self._constant_ns is not None:
             at_ns += self._constant_ns
         elif self._delay is not None:
-            at_ns += self._delay(self._delays.uniforms(number)[0])
+            at_ns += self._delay(self._delays.first(number))
             if self._in_order:
                 at_ns = self._latest_ns = max(at_ns, self._latest_ns)
-        if self._hold_chance and self._holds.uniforms(number)[0] < self._hold_chance:
+        if self._hold_chance and self._holds.first(number) < self._hold_chance:
             at_ns += self._hold_ns
-        if self._copy_chance and self._copies.uniforms(number)[0] < self._copy_chance:
+        if self._copy_chance and self._copies.first(number) < self._copy_chance:
             books.duplicated += 1
             return Copy(at_ns, self._flip(number, 0)), Copy(at_ns + self._copy_ns, self._flip(number, 1))
         return (Copy(at_ns, self._flip(number, 0) if self._flip_chance else None),)
 
     def _flip(self, number: int, copy: int) -> int | None:
-        if not self._flip_chance or self._corruptions.uniforms(number)[copy] >= self._flip_chance:
+        if not self._flip_chance:
+            return None
+        uniform = self._corruptions.first(number) if not copy else self._corruptions.uniforms(number)[copy]
+        if uniform >= self._flip_chance:
             return None
         self.books.corrupted += 1
         return int(self._flips.words(number)[copy, 0])

@@ -27,13 +27,15 @@ class Bottleneck:
     def change(self, rate: Rate) -> None:
         """Another rate, bucket or queue from now on; when what is queued leaves is settled."""
         self._rate = rate
+        self._bits, per = rate.bits_per_second.as_integer_ratio()
+        self._ns = _NS_BITS * per
         self._depth_ns = self._duration(rate.burst_bytes)
         self._packets = rate.queue_packets
         self._bytes = rate.queue_bytes
 
     def _duration(self, size: int) -> int:
         """ns in which tokens for ``size`` bytes come, rounded up."""
-        return -int(-size * _NS_BITS // self._rate.bits_per_second)
+        return -(-size * self._ns // self._bits)
 
     def leave(self, size: int, now_ns: int) -> int | None:
         """When a packet that comes now leaves; None if it is dropped."""

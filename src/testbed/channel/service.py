@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from testbed.channel.carriers import carriers_of
 from testbed.channel.loss import LossCounts
+from testbed.channel.packets import packet_bytes
 from testbed.channel.processes import FateProcess, goes_on, process_of
 from testbed.channel.steps import SteppedLink
-from testbed.channel.timed import TimedBlock
+from testbed.channel.timed import TimedBlock, room
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
 from testbed.scenario import AckLink, Link, Loss, NoLoss, Scenario
 from testbed.scenario.changes import changed
 from testbed.scenario.links import SteppedImpairments
-from testbed.wire.codec import PacketEncoder
 from testbed.wire.keys import LinkName
 from testbed.wire.messages import Acknowledgement, Change, Control, Observation, Packet
 from testbed.wire.node import ORCHESTRATOR, Node
@@ -63,13 +63,6 @@ def _process(scenario: Scenario, link: LinkName, loss: Loss, lane: int, lanes: i
     return process_of(loss, stream, lanes)
 
 
-def is_timed(scenario: Scenario, link: LinkName) -> bool:
-    """Whether a link takes time, at the beginning or after an event, or carries ACKs in batches."""
-    settings = getattr(scenario.links, link)
-    batched = isinstance(settings, AckLink) and settings.batch > 1
-    return batched or any(variant.takes_time for variant in scenario.variants(link))
-
-
 def timed_block(scenario: Scenario, link: LinkName, lane: int, lanes: int, size: int) -> TimedBlock:
     """A block of lanes of a link that takes time; size: bytes of a packet of one lane."""
     settings: SteppedImpairments = getattr(scenario.links, link)
@@ -78,7 +71,8 @@ def timed_block(scenario: Scenario, link: LinkName, lane: int, lanes: int, size:
     stepped = SteppedLink(carriers, size, period_ns, settings.deadline_ns(period_ns))
     model, _, name = _TYPES[link]
     batch = settings.batch if isinstance(settings, AckLink) else 1
-    return TimedBlock(stepped, lanes, name, first_step=model.FIRST_STEP, batch=batch)
+    keep = room(scenario.lanes, 8 * max(scenario.system.p, scenario.system.q), batch)
+    return TimedBlock(stepped, lanes, name, first_step=model.FIRST_STEP, keep=keep, batch=batch)
 
 
 def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]:
@@ -93,15 +87,8 @@ def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]
         counts = block.counts.as_counters()
         total.update({key: counts[key] for key in ("bursts", "00", "01", "10", "11")})
         total.update(books.as_counters())
+        total.update({f"transport_{key}": count for key, count in block.transport.items()})
     return dict(total)
-
-
-def packet_bytes(scenario: Scenario, link: LinkName) -> int:
-    """Bytes of a packet of one lane as the testbed encodes it."""
-    model, sender, content = _TYPES[link]
-    widths = {"y": scenario.system.p, "u": scenario.system.q}
-    array = np.zeros((1, widths[content])) if content in widths else np.zeros(1, dtype=np.uint8)
-    return len(PacketEncoder(model, "0" * 12, sender).encode(0, model.FIRST_STEP, 0, 1, {content: array}))
 
 
 class LinkService:
@@ -121,7 +108,7 @@ class LinkService:
         settings: SteppedImpairments = getattr(scenario.links, link)
         self._now = {lane: (0, settings) for lane, _ in setup.blocks}
         """By block of lanes: how many changes were made, and the link after them."""
-        timed = is_timed(scenario, link)
+        timed = scenario.takes_time(link)
         self._losses = {lane: loss_process(scenario, link, lane, lanes) for lane, lanes in setup.blocks if not timed}
         self._process_of = partial(_process, scenario, link)
         size = packet_bytes(scenario, link)

@@ -6,12 +6,14 @@ that, and late otherwise: then it belongs to the first later packet before whose
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
 from testbed.channel.books import Books
 from testbed.channel.carrier import Carrier
+from testbed.channel.tcp import TcpCarrier
 from testbed.numerics.lanes import Bools
 from testbed.scenario.links import Impairments
 
@@ -57,6 +59,15 @@ class SteppedLink:
         """Other impairments for the packets from now on, in every lane."""
         for carrier in self._carriers:
             carrier.change(settings)
+
+    @property
+    def transport(self) -> Counter[str]:
+        """What the connections of all lanes did; nothing where there are none."""
+        total: Counter[str] = Counter()
+        for carrier in self._carriers:
+            if isinstance(carrier, TcpCarrier):
+                total.update(carrier.as_counters())
+        return total
 
     @property
     def books(self) -> Books:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ Arrays = dict[str, NDArray[Any]]
 
 _KEEP_BYTES = 64_000_000
 _KEEP_LEAST = 64
+_KEEP_BESIDE = 400  # bytes that a packet takes beside its content
 
 
 class TimedBlock:
@@ -25,13 +27,14 @@ class TimedBlock:
     What is kept is bounded: what comes more than ``keep`` packets late is dropped and counted as "stale".
     """
 
-    def __init__(self, link: SteppedLink, lanes: int, name: str, *, first_step: int, batch: int = 1) -> None:
-        """name: of the content. first_step: step of packet 0. batch: outcomes that a packet carries (ACKs)."""
+    def __init__(self, link: SteppedLink, lanes: int, name: str, *, first_step: int, keep: int, batch: int = 1) -> None:
+        """name: of the content. first_step: step of packet 0. keep: see above, and ``room``. batch: outcomes that a
+        packet carries (ACKs), less than keep."""
         self._link, self._lanes, self._name = link, lanes, name
         self._first_step, self._batch = first_step, batch
         self._contents: dict[int, NDArray[Any]] = {}
         self._known: dict[int, Bools] = {}
-        self._keep = 0
+        self._keep = keep
         self._late = 0
         self._stale = 0
         self.counts = LossCounts()
@@ -44,6 +47,11 @@ class TimedBlock:
         books.delivered -= self._stale
         books.dropped["stale"] += self._stale
         return books
+
+    @property
+    def transport(self) -> Counter[str]:
+        """What the connections under it did."""
+        return self._link.transport
 
     @property
     def late(self) -> int:
@@ -68,8 +76,9 @@ class TimedBlock:
         fresh: dict[int, Bools] = {}
         for packet, lanes in [*arrivals.late, (number, arrivals.in_time)]:
             if packet < number:
-                self._late += int(np.count_nonzero(lanes))
-                if packet not in self._contents:
+                if packet in self._contents:
+                    self._late += int(np.count_nonzero(lanes))
+                else:
                     self._stale += int(np.count_nonzero(lanes))
             for one in range(max(packet - self._batch + 1, 0), packet + 1):
                 if one not in self._contents:
@@ -95,13 +104,16 @@ class TimedBlock:
         }
 
     def _remember(self, number: int, content: NDArray[Any]) -> None:
-        if not self._keep:
-            self._keep = max(_KEEP_LEAST, self._batch, _KEEP_BYTES // max(1, content.nbytes))
         self._contents[number] = np.array(content)
         self._known[number] = np.zeros(self._lanes, dtype=np.bool_)
-        old = number - self._keep
+        old = number - self._keep - 1
         self._contents.pop(old, None)
         self._known.pop(old, None)
+
+
+def room(lanes: int, entry_bytes: int, batch: int) -> int:
+    """Packets to keep on a link of so many lanes in all, each with so many bytes of content."""
+    return max(_KEEP_LEAST, batch, _KEEP_BYTES // (lanes * entry_bytes + _KEEP_BESIDE))
 
 
 def _blanked(content: NDArray[Any], lanes: Bools) -> NDArray[Any]:

@@ -9,8 +9,9 @@ from typing import Any
 from testbed.channel.chains import chain_of
 from testbed.channel.law import LossModel
 from testbed.channel.loss import LossCounts
+from testbed.channel.packets import packet_bytes
 from testbed.channel.pipeline import Pipeline
-from testbed.channel.service import FIRST_STEP, loss_of, packet_bytes, role_of
+from testbed.channel.service import FIRST_STEP, loss_of, role_of
 from testbed.scenario import Scenario
 from testbed.scenario.changes import changed
 from testbed.scenario.links import SteppedImpairments

@@ -18,6 +18,7 @@ from testbed.errors import UsageError, did_you_mean
 if TYPE_CHECKING:
     from testbed.channel.kernel.hosts import Backend, Hosts, Way
     from testbed.scenario import Scenario
+    from testbed.scenario.links import SteppedImpairments
 
 _INTERRUPTED = 130
 _BACKENDS: tuple[Backend, ...] = ("tun", "netem")
@@ -30,7 +31,10 @@ def hosts(
     ],
     name: Annotated[str, typer.Option("--link", metavar="LINK", help="Its link that impairs the way from a to b.")],
     back: Annotated[
-        str | None, typer.Option(metavar="LINK", help="The link that impairs the way back; default: nothing does.")
+        str | None,
+        typer.Option(
+            metavar="LINK", help="The link that impairs the way back; default: the table `back` of --link, or nothing."
+        ),
     ] = None,
     b: Annotated[
         str | None, typer.Option("--b", metavar="COMMAND", help="What runs in host b, until that in a has ended.")
@@ -90,18 +94,18 @@ def _ways(
     from testbed.channel.service import role_of
     from testbed.scenario.links import Impairments
 
-    out = []
-    for given, option in ((name, "--link"), (back, "--back")):
-        if given is None:
-            out.append(Impairments())
-            continue
-        link = link_name(given, option)
-        if link == "ack" and scenario.links.ack.mode == "none":
-            allowed = 'with [links.ack] mode = "perfect" or "link"'
-            raise UsageError(f"{option} ack: the scenario has none; allowed: {allowed}")
-        out.append(getattr(scenario.links, link))
+    forward = _link(scenario, name, "--link")
+    backward = forward.back if back is None else _link(scenario, back, "--back")
     role = role_of(link_name(name))
-    return Way(out[0], role, trace), Way(out[1], f"{role}.backward", trace_back)
+    return Way(forward, role, trace), Way(backward or Impairments(), f"{role}.backward", trace_back)
+
+
+def _link(scenario: Scenario, name: str, option: str) -> SteppedImpairments:
+    link = link_name(name, option)
+    if link == "ack" and scenario.links.ack.mode == "none":
+        raise UsageError(f'{option} ack: the scenario has none; allowed: with [links.ack] mode = "perfect" or "link"')
+    settings: SteppedImpairments = getattr(scenario.links, link)
+    return settings
 
 
 def _backend(name: str) -> Backend:

@@ -15,7 +15,7 @@ from typing import Any, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from testbed.channel.in_time import law_in_steps
+from testbed.channel.in_time import law_of_link
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.model import Estimator, Model
 from testbed.scenario import EstimatorSpec, Scenario
@@ -109,8 +109,8 @@ def model_of(scenario: Scenario) -> Model:
         R=np.array(system.R),
         x0_mean=np.array(system.x0_mean),
         P0=np.array(system.P0),
-        control=law_in_steps(scenario.links.control, scenario.clock.period_ns),
-        observation=law_in_steps(scenario.links.observation, scenario.clock.period_ns),
+        control=law_of_link(scenario, "control"),
+        observation=law_of_link(scenario, "observation"),
         G=g,
         W=np.array(system.Q),
         dA=tuple(np.array(d) for d in d_a),

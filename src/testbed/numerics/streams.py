@@ -44,6 +44,17 @@ class Stream:
         self._width, self._lane, self._lanes = width, lane, lanes
         self._tiles = _TILES if lanes <= _FEWER else 1
         self._ahead: dict[str, _Ahead] = {}
+        self._firsts: list[float] = []
+        self._firsts_from = 0
+
+    def first(self, step: int) -> float:
+        """What ``uniforms(step)[0]`` is for one lane, which is asked for most often."""
+        offset = step - self._firsts_from
+        if not 0 <= offset < len(self._firsts):
+            ahead, offset = self._drawn(self._uniform.__name__, self._width, step)
+            self._firsts_from = step - offset
+            self._firsts = _uniform(ahead.raw[:, 0, 0]).tolist()
+        return self._firsts[offset]
 
     def uniforms(self, step: int) -> Vector:
         """``width`` components, uniform on [0, 1)."""

@@ -12,10 +12,11 @@ from testbed import __version__
 from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.channel.hidden import Hidden
-from testbed.channel.in_time import law_in_steps
+from testbed.channel.in_time import law_of_link
 from testbed.estimator.bounds import held_factor
+from testbed.estimator.buffers import acks_of, largest_buffer
 from testbed.estimator.registry import model_of
-from testbed.estimator.service import acks_of, role_of
+from testbed.estimator.service import role_of
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import (
     BoundFigures,
@@ -77,7 +78,9 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
     sent, dropped, bursts = counters["sent"], counters["dropped"], counters["bursts"]
     losses = {"loss": dropped} if dropped else {}
     causes = {key.removeprefix("dropped_"): n for key, n in counters.items() if key.startswith("dropped_") and n}
+    transport = {key.removeprefix("transport_"): n for key, n in counters.items() if key.startswith("transport_")}
     return LinkFigures(
+        transport=transport,
         sent=sent,
         delivered=counters["delivered"],
         dropped=dropped,
@@ -94,7 +97,7 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
 
 def moment_checks(scenario: Scenario) -> list[Check]:
     """Whether the EEC and the variance of its sample mean can be finite."""
-    A, losses = np.array(scenario.system.A), law_in_steps(scenario.links.observation, scenario.clock.period_ns)
+    A, losses = np.array(scenario.system.A), law_of_link(scenario, "observation", largest_buffer(scenario))
     order, rho, decay = finite_moment_order(A, losses), spectral_radius(A), losses.burst_decay
     hidden = isinstance(losses, Hidden)
     burst = f"θ = {decay:.6g}" if hidden else f"P(arrival after a loss) = {losses.recovery:.6g}"
@@ -239,7 +242,7 @@ def _bounds(conductor: Conductor) -> BoundFigures | None:
         upper["upper_correlated_mean"] = series.mean["upper_correlated"]
         upper["upper_correlated_stderr"] = series.stderr["upper_correlated"]
     reason: str | None = None
-    if law_in_steps(scenario.links.control, scenario.clock.period_ns).covariance_factor is None:
+    if law_of_link(scenario, "control").covariance_factor is None:
         reason = "the control losses never mix, and S holds for independent ones"
     if scenario.uncertainty is not None:
         reason = "the bounds are those of the nominal model, and the plant departs from it"

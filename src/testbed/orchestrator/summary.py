@@ -119,6 +119,9 @@ class LinkFigures(_Model):
     in_flight: NonNegativeInt = 0
     corrupted: NonNegativeInt = Field(default=0, description="copies that arrived with a bit flipped")
     causes: dict[str, NonNegativeInt] = Field(default_factory=dict, description="those dropped, by cause")
+    transport: dict[str, NonNegativeInt] = Field(
+        default_factory=dict, description="what connections did: retransmissions, recoveries, timeouts, probes, …"
+    )
     transitions: Transitions = Transitions()
     loss_rate: Number = None
     mean_burst: Number = Field(default=None, description="mean number of packets lost in a row")

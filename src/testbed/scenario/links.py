@@ -1,8 +1,8 @@
 """The three links, and what happens to their packets."""
 
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from testbed.scenario.base import Part, problem, shown
@@ -11,6 +11,7 @@ from testbed.scenario.durations import Duration, parse_duration
 from testbed.scenario.impairments import Corrupt, Delay, Duplicate, Rate, Reorder
 from testbed.scenario.loss_laws import LossLaw, NoLoss
 from testbed.scenario.losses import Loss
+from testbed.scenario.presets import presets
 from testbed.scenario.replays import ScriptedLoss, TraceLoss
 
 
@@ -39,8 +40,21 @@ class Impairments(Part):
         return self
 
 
+def _link_schema(schema: dict[str, Any]) -> None:
+    schema["properties"]["preset"] = {
+        "type": "string",
+        "title": "Preset",
+        "enum": list(presets()),
+        "description": "Name of a preset, whose keys hold where the table does not give them; the control link is one "
+        "down, from the network to the device, the others are up.",
+    }
+
+
 class SteppedImpairments(Impairments):
     """A link of a run, whose packets belong to steps."""
+
+    model_config = ConfigDict(json_schema_extra=_link_schema)
+    other_keys: ClassVar[tuple[str, ...]] = ("preset",)
 
     deadline: Duration | None = Field(
         default=None,
@@ -129,14 +143,16 @@ class Links(Part):
     observation: ObservationLink = Field(default_factory=ObservationLink, description="Plant to estimators: y.")
     ack: AckLink = Field(default_factory=AckLink, description="Plant to estimators: which u were applied.")
 
-    def of_run(self, packets: int) -> "Links":
+    def of_run(self, packets: int, period_ns: int) -> "Links":
         """For a run of so many packets a link: replayed losses with their law. A problem of validation if one ends."""
         update = {}
         for name in type(self).model_fields:
             link: Impairments = getattr(self, name)
             if isinstance(link.loss, (TraceLoss, ScriptedLoss)):
                 try:
-                    update[name] = link.model_copy(update={"loss": link.loss.of_run(packets)})
+                    slot_ns = period_ns if link.slot is None else parse_duration(link.slot)
+                    fates = packets if link.slot is None else (packets - 1) * period_ns // slot_ns + 1
+                    update[name] = link.model_copy(update={"loss": link.loss.of_run(fates)})
                 except PydanticCustomError as error:
                     context = error.context or {}
                     raise problem(context["text"], f"{name}.loss.{context['at']}") from None

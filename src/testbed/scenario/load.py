@@ -11,6 +11,7 @@ from testbed.errors import UsageError
 from testbed.scenario.base import shown
 from testbed.scenario.explain import explain
 from testbed.scenario.models import Scenario
+from testbed.scenario.presets import resolved
 from testbed.scenario.table import read_table, read_text
 from testbed.scenario.trace_file import read_fates
 
@@ -86,6 +87,10 @@ def _absolute(table: dict[str, Any], keys: tuple[str, ...], base_dir: Path) -> d
 
 
 def _read_link(name: str, table: dict[str, Any], base_dir: Path) -> dict[str, Any]:
+    try:
+        table = resolved(table, "down" if name == "control" else "up")
+    except UsageError as error:
+        raise UsageError(f"links.{name}.{error}") from None
     return _read_trace(name, _read_delays(name, table, base_dir), base_dir)
 
 

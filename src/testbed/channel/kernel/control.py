@@ -25,7 +25,8 @@ class Control:
         line = json.dumps(message).encode() + b"\n"
         ancillary = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", fds))] if fds else []
         sent = self._end.sendmsg([line], ancillary)
-        self._end.sendall(line[sent:])
+        if sent < len(line):
+            self._end.sendall(line[sent:])
 
     def receive(self, fds_max: int = 0) -> tuple[dict[str, Any], list[int]]:
         """The next message. Raises EOFError if the other end is gone, TimeoutError if it says nothing."""
