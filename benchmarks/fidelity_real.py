@@ -37,9 +37,8 @@ def through_kernel(cell: Cell, seconds: float, stop: threading.Event) -> Seen:
     messages = cell.messages(seconds)
     running: list[subprocess.Popen[Any]] = []
     with Hosts(there, back, seed=1, congestion=CONGESTION) as hosts:
-        over = threading.Timer(_OPEN_S + seconds + cell.drain_s + _SLACK_S, _kill, [running])
-        over.daemon = True
-        over.start()
+        limit_s = _OPEN_S + seconds + cell.drain_s + _SLACK_S
+        threading.Thread(target=_end_in, args=(limit_s, stop, running), daemon=True).start()
         try:
             endpoint = f"{cell.transport}/{hosts.b.address}:{_PORT}"
             receiver = _start(running, hosts.b, ["receive", endpoint, str(messages)])
@@ -60,7 +59,6 @@ def through_kernel(cell: Cell, seconds: float, stop: threading.Event) -> Seen:
             ways = hosts.books()
             timeouts = _timeouts(hosts) - before
         finally:
-            over.cancel()
             _kill(running)
     numbers = np.array(got["numbers"], dtype=np.int64)
     at_ms = (np.array(got["at_ns"], dtype=np.int64) - begin_ns).astype(np.float64) * 1e-6
@@ -100,6 +98,12 @@ def _heard(process: subprocess.Popen[Any]) -> dict[str, Any]:
     except ValueError:
         raise Failed("an end of the link died, or the cell's time is over") from None
     return answer
+
+
+def _end_in(limit_s: float, stop: threading.Event, running: list[subprocess.Popen[Any]]) -> None:
+    """When the time is over, or all is to stop."""
+    stop.wait(limit_s)
+    _kill(running)
 
 
 def _kill(running: list[subprocess.Popen[Any]]) -> None:
