@@ -253,6 +253,9 @@ class Highest:
         point = 1.0 - 2.0**-53
         return [point if self._lanes == 1 else np.full(self._lanes, point)]
 
+    def first(self, step: int) -> Any:
+        return self.uniforms(step)[0]
+
 
 @pytest.mark.parametrize("lanes", [1, 2])
 def test_rounding_leads_to_no_state_that_cannot_be(lanes: int) -> None:
