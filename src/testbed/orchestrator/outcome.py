@@ -26,6 +26,7 @@ from testbed.orchestrator.summary import (
     Timing,
     Transitions,
 )
+from testbed.plant.controller import ROLE as CONTROLLER
 from testbed.plant.inputs import control_bound
 from testbed.scenario import Scenario
 from testbed.wire.messages import Status
@@ -50,6 +51,7 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
     rejected = {role: dict(r.rejected) for role, r in sorted(conductor.reports.items()) if r.rejected}
     if conductor.node.rejected:
         rejected[ORCHESTRATOR] = dict(conductor.node.rejected)
+    pacing = conductor.pacing
     broken = next((check.text for check in checks if check.name == "books" and not check.ok), None)
     return Summary.model_validate(
         {
@@ -67,6 +69,7 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
             "checks": checks,
             "rejected": rejected,
             "timing": timing,
+            "realtime": pacing and pacing.figures(conductor.reports.get(CONTROLLER)),
             "versions": versions(),
         }
     )

@@ -86,7 +86,8 @@ class Run:
             if recorder is not None:
                 cleanup.callback(recorder.close)
             cleanup.callback(supervisor.close, 0.0)
-            bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.window == 1)
+            bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.express)
+            bus.timed = self._setup.real
             cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
             conductor = self._conductor(bus, recorder)
             bus.subscribe(conductor.node.keys.warm("*"), lambda _key, _payload: None)
@@ -106,7 +107,7 @@ class Run:
     @np.errstate(all="ignore")
     def in_process(self, schedule: int | None = None) -> Summary:
         """On the in-process bus; ``schedule`` seeds the order in which messages to different roles are delivered."""
-        network = MemoryNetwork(schedule)
+        network = MemoryNetwork(schedule, timed=self._setup.real)
         recorder = self._recorder()
         conductor = self._conductor(network.bus(), recorder)
         nodes: list[tuple[Node, Role]] = []
@@ -116,7 +117,7 @@ class Run:
                 cleanup.callback(recorder.close)
             try:
                 for spec in self._roles:
-                    node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.tap)
+                    node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.copied)
                     nodes.append((node, spec.build(node, self._setup)))
                     node.announce()
                 while not conductor.over and not interrupts.asked:

@@ -1,4 +1,4 @@
-"""The controller: sends u_k as the clock allows; in a closed loop, when the estimate of k has come."""
+"""The controller: sends u_k as the clock allows; in a closed loop of virtual time, when the estimate of k has come."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from testbed.numerics.lanes import Floats, array_of, constant, constant_times, vector_of
 from testbed.plant.inputs import open_loop
+from testbed.plant.paced import PacedFeedback, PacedOpenLoop
 from testbed.scenario import FeedbackInput
 from testbed.wire.messages import ClockMessage, Control, EstimateMessage
 from testbed.wire.node import ORCHESTRATOR, Node
@@ -17,12 +18,11 @@ from testbed.wire.setup import Setup
 ROLE = "controller"
 
 
-def build(node: Node, setup: Setup) -> OpenLoop | Feedback:
-    return (
-        Feedback(node, setup, setup.scenario.input)
-        if isinstance(setup.scenario.input, FeedbackInput)
-        else OpenLoop(node, setup)
-    )
+def build(node: Node, setup: Setup) -> OpenLoop | Feedback | PacedOpenLoop | PacedFeedback:
+    source = setup.scenario.input
+    if isinstance(source, FeedbackInput):
+        return (PacedFeedback if setup.real else Feedback)(node, setup, source)
+    return (PacedOpenLoop if setup.real else OpenLoop)(node, setup)
 
 
 class OpenLoop:
