@@ -21,6 +21,7 @@ from testbed.channel.in_time import law_of_link
 from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain
 from testbed.estimator.bounds import held_factor
+from testbed.estimator.buffers import largest_buffer
 from testbed.numerics.lanes import Floats
 from testbed.scenario import FeedbackInput, Input, Links, Loss, Scenario
 
@@ -109,7 +110,7 @@ def analyze(scenario: Scenario) -> dict[str, Any]:
 def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
     A = facts.A
     observed, controlled = scenario.links.observation.loss, scenario.links.control.loss
-    chain = _simplest(law_of_link(scenario, "observation"))
+    chain = _simplest(law_of_link(scenario, "observation", largest_buffer(scenario)))
     in_time = law_of_link(scenario, "control")
     control = _simplest(in_time)
     verdict = observation_verdict(facts, chain)

@@ -63,13 +63,6 @@ def _process(scenario: Scenario, link: LinkName, loss: Loss, lane: int, lanes: i
     return process_of(loss, stream, lanes)
 
 
-def is_timed(scenario: Scenario, link: LinkName) -> bool:
-    """Whether a link takes time, at the beginning or after an event, or carries ACKs in batches."""
-    settings = getattr(scenario.links, link)
-    batched = isinstance(settings, AckLink) and settings.batch > 1
-    return batched or any(variant.takes_time for variant in scenario.variants(link))
-
-
 def timed_block(scenario: Scenario, link: LinkName, lane: int, lanes: int, size: int) -> TimedBlock:
     """A block of lanes of a link that takes time; size: bytes of a packet of one lane."""
     settings: SteppedImpairments = getattr(scenario.links, link)
@@ -115,7 +108,7 @@ class LinkService:
         settings: SteppedImpairments = getattr(scenario.links, link)
         self._now = {lane: (0, settings) for lane, _ in setup.blocks}
         """By block of lanes: how many changes were made, and the link after them."""
-        timed = is_timed(scenario, link)
+        timed = scenario.takes_time(link)
         self._losses = {lane: loss_process(scenario, link, lane, lanes) for lane, lanes in setup.blocks if not timed}
         self._process_of = partial(_process, scenario, link)
         size = packet_bytes(scenario, link)

@@ -11,7 +11,6 @@ from typing import Any, cast, get_args
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from testbed.channel.service import is_timed
 from testbed.channel.service import role_of as link_role
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.bounds_service import ROLE as BOUNDS
@@ -129,7 +128,7 @@ class Conductor:
         event = Happened(step=self._granted + 1, by="command", link=link, set=change)
         events = sorted((e for e in [*self.events, event] if e.link == link), key=lambda e: e.step)
         after = in_turn(getattr(self.setup.scenario.links, link), [e.set for e in events])
-        if any(variant.takes_time for variant in after) and not is_timed(self.setup.scenario, name):
+        if any(variant.takes_time for variant in after) and not self.setup.scenario.takes_time(name):
             raise UsageError(
                 f"link {link!r} began without time: allowed in this run: another loss; for more, begin with a delay, "
                 "such as { kind = 'constant', by = '0 s' }"

@@ -14,8 +14,9 @@ from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.channel.hidden import Hidden
 from testbed.channel.in_time import law_of_link
 from testbed.estimator.bounds import held_factor
+from testbed.estimator.buffers import acks_of, largest_buffer
 from testbed.estimator.registry import model_of
-from testbed.estimator.service import acks_of, role_of
+from testbed.estimator.service import role_of
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import (
     BoundFigures,
@@ -99,7 +100,7 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
 
 def moment_checks(scenario: Scenario) -> list[Check]:
     """Whether the EEC and the variance of its sample mean can be finite."""
-    A, losses = np.array(scenario.system.A), law_of_link(scenario, "observation")
+    A, losses = np.array(scenario.system.A), law_of_link(scenario, "observation", largest_buffer(scenario))
     order, rho, decay = finite_moment_order(A, losses), spectral_radius(A), losses.burst_decay
     hidden = isinstance(losses, Hidden)
     burst = f"θ = {decay:.6g}" if hidden else f"P(arrival after a loss) = {losses.recovery:.6g}"

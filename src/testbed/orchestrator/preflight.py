@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from testbed.errors import UsageError
+from testbed.estimator.buffers import acks_of
 from testbed.estimator.registry import check, model_of
-from testbed.estimator.service import acks_of
 from testbed.scenario import Scenario
 
 

@@ -143,14 +143,16 @@ class Links(Part):
     observation: ObservationLink = Field(default_factory=ObservationLink, description="Plant to estimators: y.")
     ack: AckLink = Field(default_factory=AckLink, description="Plant to estimators: which u were applied.")
 
-    def of_run(self, packets: int) -> "Links":
+    def of_run(self, packets: int, period_ns: int) -> "Links":
         """For a run of so many packets a link: replayed losses with their law. A problem of validation if one ends."""
         update = {}
         for name in type(self).model_fields:
             link: Impairments = getattr(self, name)
             if isinstance(link.loss, (TraceLoss, ScriptedLoss)):
                 try:
-                    update[name] = link.model_copy(update={"loss": link.loss.of_run(packets)})
+                    slot_ns = period_ns if link.slot is None else parse_duration(link.slot)
+                    fates = packets if link.slot is None else (packets - 1) * period_ns // slot_ns + 1
+                    update[name] = link.model_copy(update={"loss": link.loss.of_run(fates)})
                 except PydanticCustomError as error:
                     context = error.context or {}
                     raise problem(context["text"], f"{name}.loss.{context['at']}") from None

@@ -9,16 +9,18 @@ from testbed.errors import UsageError, did_you_mean
 from testbed.scenario.actuator import Actuator
 from testbed.scenario.base import Count, Part, count, problem, shown, size
 from testbed.scenario.changes import in_turn
-from testbed.scenario.durations import parse_duration
+from testbed.scenario.durations import format_duration, parse_duration
 from testbed.scenario.estimators import EstimatorSpec
 from testbed.scenario.events import LinkEvent
 from testbed.scenario.inputs import ConstantInput, FeedbackInput, Input, TableInput, check_channels
-from testbed.scenario.links import Links, SteppedImpairments
+from testbed.scenario.links import AckLink, Links, SteppedImpairments
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Transport
 from testbed.scenario.uncertainty import Uncertainty
 
 SEED_MAX = 2**63 - 1
+SLOTS_A_PERIOD = 1000
+"""Moves of a chain by time, from packet to packet, at most."""
 
 
 def _no_input(data: dict[str, Any]) -> ConstantInput | None:
@@ -80,10 +82,8 @@ class Scenario(Part):
     @classmethod
     def _check_links(cls, links: Links, info: ValidationInfo) -> Links:
         clock: Clock | None = info.data.get("clock")
-        for name in Links.model_fields if clock is not None else ():
-            deadline = getattr(links, name).deadline
-            if clock is not None and deadline is not None and parse_duration(deadline) > clock.period_ns:
-                raise problem(f"got {deadline!r}; allowed: at most the period, {clock.period!r}", f"{name}.deadline")
+        if clock is not None:
+            _check_times(links, clock)
         observation = links.observation
         if observation.on_loss == "noise" and observation.takes_time:
             raise problem(
@@ -91,7 +91,9 @@ class Scenario(Part):
                 "allowed there: nothing",
                 "observation.on_loss",
             )
-        return links.of_run(info.data["steps"]) if "steps" in info.data else links
+        if clock is None or "steps" not in info.data:
+            return links
+        return links.of_run(info.data["steps"], clock.period_ns)
 
     @field_validator("events")
     @classmethod
@@ -117,6 +119,12 @@ class Scenario(Part):
             raise problem("got 'hold', but system.B is not given; allowed: zero, or hold with system.B", "on_loss")
         return actuator
 
+    def takes_time(self, link: str) -> bool:
+        """Whether the link of that name takes time, at the beginning or after an event, or carries ACKs in batches."""
+        settings = getattr(self.links, link)
+        batched = isinstance(settings, AckLink) and settings.batch > 1
+        return batched or any(variant.takes_time for variant in self.variants(link))
+
     @field_validator("input")
     @classmethod
     def _check_input(cls, source: Input | None, info: ValidationInfo) -> Input | None:
@@ -136,6 +144,20 @@ class Scenario(Part):
         if isinstance(source, FeedbackInput):
             return _closed_loop(source, system, info)
         return source
+
+
+def _check_times(links: Links, clock: Clock) -> None:
+    """A problem of validation where a deadline or a slot does not fit the period."""
+    least_ns = -(-clock.period_ns // SLOTS_A_PERIOD)
+    for name in Links.model_fields:
+        link: SteppedImpairments = getattr(links, name)
+        if link.deadline_ns(clock.period_ns) > clock.period_ns:
+            raise problem(f"got {link.deadline!r}; allowed: at most the period, {clock.period!r}", f"{name}.deadline")
+        if link.slot is not None and parse_duration(link.slot) < least_ns:
+            least = format_duration(least_ns)
+            raise problem(
+                f"got {link.slot!r}; allowed: {least!r} or more, with the period {clock.period!r}", f"{name}.slot"
+            )
 
 
 def _check_event(links: Links, events: Sequence[LinkEvent], i: int, clock: Clock, steps: int) -> None:
