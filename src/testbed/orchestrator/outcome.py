@@ -18,6 +18,7 @@ from testbed.estimator.buffers import acks_of, largest_buffer
 from testbed.estimator.registry import model_of
 from testbed.estimator.service import role_of
 from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.realtime_figures import RealTime
 from testbed.orchestrator.summary import (
     BoundFigures,
     Check,
@@ -33,6 +34,8 @@ from testbed.scenario import Scenario
 from testbed.wire.messages import Status
 from testbed.wire.node import ORCHESTRATOR
 
+_DATE_US = 100.0
+
 
 def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: Timing) -> Summary:
     """The summary of a run that is over, whole or not."""
@@ -47,12 +50,15 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
     complete = status == "complete"
     checks = [*moment_checks(scenario), *between_bounds(scenario, estimators, bounds)]
     checks += rounding(collector.largest_state, estimators)
+    pacing = conductor.pacing
+    realtime = None if pacing is None else pacing.figures(conductor.reports.get(CONTROLLER))
+    if realtime is not None:
+        checks += date_kept(realtime)
     if complete:
         checks += books(scenario, links, collector.applied)
     rejected = {role: dict(r.rejected) for role, r in sorted(conductor.reports.items()) if r.rejected}
     if conductor.node.rejected:
         rejected[ORCHESTRATOR] = dict(conductor.node.rejected)
-    pacing = conductor.pacing
     broken = next((check.text for check in checks if check.name == "books" and not check.ok), None)
     return Summary.model_validate(
         {
@@ -70,10 +76,21 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
             "checks": checks,
             "rejected": rejected,
             "timing": timing,
-            "realtime": pacing and pacing.figures(conductor.reports.get(CONTROLLER)),
+            "realtime": realtime,
             "versions": versions(),
         }
     )
+
+
+def date_kept(realtime: RealTime) -> list[Check]:
+    """A finding where the date was set during the run: publications are dated by it, and the pace is not."""
+    if abs(realtime.date_set_us) <= _DATE_US:
+        return []
+    text = (
+        f"the date was set by {realtime.date_set_us / 1e3:.3g} ms during the run: the pace was kept, but the times "
+        "in `realtime` are wrong by up to that much, and so are the deadlines counted as missed"
+    )
+    return [Check(name="date", ok=False, text=text)]
 
 
 def link_figures(counters: dict[str, int]) -> LinkFigures:

@@ -57,7 +57,7 @@ class Pacing:
         clock = self._bus.clock
         counters = {} if controller is None else controller.counters
         return self.times.figures(
-            self.times.due(self._now()) if self._start_ns else 0,
+            self.times.due(self._now() - self._setup.scenario.clock.deadline_ns) if self._start_ns else 0,
             self._collector.completed,
             outstanding_allowed=self._setup.window,
             date_set_us=(clock.date_ns() - self._now()) / 1e3 if self._start_ns else 0.0,

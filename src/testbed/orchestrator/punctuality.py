@@ -112,7 +112,7 @@ class Punctuality:
         )
 
     def figures(self, due: int, steps: int, **more: object) -> RealTime:
-        """due: steps that were due when the run ended. steps: those of which the summary has figures."""
+        """due: steps whose deadline was over when the run ended. steps: those of which the summary has figures."""
         out = {}
         for topic, stage in self.stages.items():
             before = self.stages[stage.before].published if stage.before else [0] * len(stage.published)

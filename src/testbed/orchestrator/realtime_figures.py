@@ -35,7 +35,9 @@ class Stage(_Model):
     )
     missed: NonNegativeInt = Field(description="steps published after t_k + deadline_us")
     first_missed: NonNegativeInt | None = Field(default=None, description="the first of them")
-    absent: NonNegativeInt = Field(description="steps that were due before the run ended and had not come by then")
+    absent: NonNegativeInt = Field(
+        description="steps whose deadline was over when the run ended, and that had not come by then"
+    )
     published_us: tuple[float | None, ...] = Field(description="from t_k to the publication, µs, by completed step")
 
 
