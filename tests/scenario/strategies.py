@@ -140,6 +140,7 @@ clocks = st.one_of(
             "window": st.integers(1, 100),
             "deadlines": st.sampled_from(["soft", "strict"]),
             "deadline": durations,
+            "priority": st.integers(1, 99),
         },
     ),
 )

@@ -95,6 +95,8 @@ EXACT: list[tuple[dict[str, Any], str]] = [
         "links.control.rate.bits_per_second: got 0; allowed: more than 0, at most 1e+15",
     ),
     ({"clock.deadlines": "soft"}, "clock.deadlines: got 'soft'; allowed: only with mode 'real'"),
+    ({"clock.priority": 10}, "clock.priority: got 10; allowed: only with mode 'real'"),
+    ({"clock": {"mode": "real", "priority": 100}}, "clock.priority: got 100; allowed: 1 … 99"),
     ({"clock.deadline": "5 ms"}, "clock.deadline: got '5 ms'; allowed: only with mode 'real'"),
     (
         {"clock": {"mode": "real", "deadlines": "strickt"}},

@@ -53,7 +53,7 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
     pacing = conductor.pacing
     realtime = None if pacing is None else pacing.figures(conductor.reports.get(CONTROLLER))
     if realtime is not None:
-        checks += date_kept(realtime)
+        checks += [*date_kept(realtime), *priority_granted(realtime)]
     if complete:
         checks += books(scenario, links, collector.applied)
     rejected = {role: dict(r.rejected) for role, r in sorted(conductor.reports.items()) if r.rejected}
@@ -91,6 +91,14 @@ def date_kept(realtime: RealTime) -> list[Check]:
         "in `realtime` are wrong by up to that much, and so are the deadlines counted as missed"
     )
     return [Check(name="date", ok=False, text=text)]
+
+
+def priority_granted(realtime: RealTime) -> list[Check]:
+    """Whether the system granted the real-time priority that was asked for."""
+    if realtime.priority is None:
+        return []
+    granted = f"SCHED_FIFO {realtime.priority} for {', '.join(realtime.priorities) or 'no process'}"
+    return [Check(name="priority", ok=bool(realtime.priorities), text=granted)]
 
 
 def link_figures(counters: dict[str, int]) -> LinkFigures:

@@ -37,6 +37,8 @@ class Pacing:
         self._strict = setup.scenario.clock.deadlines == "strict"
         self._granted = 0
         self._start_ns = 0
+        self.priorities: dict[str, int] = {}
+        """Role → real-time priority, of the processes that have one."""
         self.times = Punctuality(setup.scenario, len(setup.blocks))
 
     def begin(self) -> None:
@@ -61,6 +63,8 @@ class Pacing:
             self._collector.completed,
             outstanding_allowed=self._setup.window,
             date_set_us=(clock.date_ns() - self._now()) / 1e3 if self._start_ns else 0.0,
+            priority=self._setup.scenario.clock.priority,
+            priorities=self.priorities,
             held_controls=counters.get("held", 0),
             held_steps_max=counters.get("held_steps", 0),
         )

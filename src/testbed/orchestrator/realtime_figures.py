@@ -51,6 +51,10 @@ class RealTime(_Model):
     outstanding_max: NonNegativeInt = Field(description="the most steps that were due and not complete")
     outstanding_allowed: NonNegativeInt = Field(description="more than so many end the run")
     date_set_us: float = Field(description="by how much the date was set during the run, which shifts all of this")
+    priority: NonNegativeInt | None = Field(default=None, description="the real-time priority that was asked for")
+    priorities: dict[str, NonNegativeInt] = Field(
+        default_factory=dict, description="the real-time priorities that the system granted, by role"
+    )
     held_controls: NonNegativeInt = Field(
         default=0, description="closed loop: control packets sent with an estimate older than that of their step"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import secrets
 import shlex
 import threading
@@ -18,6 +19,7 @@ from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.interrupts import Interrupts, noted
 from testbed.orchestrator.outcome import summarise
 from testbed.orchestrator.preflight import check_estimators, prepare_folder
+from testbed.orchestrator.priority import Priorities
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.roles import RoleSpec, roles_of
 from testbed.orchestrator.running import published
@@ -26,7 +28,7 @@ from testbed.orchestrator.summary import Summary, Timing, write_summary
 from testbed.orchestrator.supervise import Supervisor, command_of
 from testbed.scenario import Scenario, to_toml
 from testbed.wire.memory_bus import MemoryNetwork
-from testbed.wire.node import Node
+from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.process import settle_memory
 from testbed.wire.setup import Role, Setup
 
@@ -98,7 +100,7 @@ class Run:
                 else:
                     supervisor.start(role, endpoint, self._setup.run, transport)
             conductor.collector.prepare()
-            with _settled_memory():
+            with _settled_memory(), self._raised(conductor, lambda: supervisor.pids):
                 self._drive(conductor, bus, supervisor, interrupts, patient=bool(external))
             self._settle(conductor, bus)
             supervisor.close(_LEAVE_S if conductor.collector.finished else 0.2)
@@ -113,6 +115,7 @@ class Run:
         nodes: list[tuple[Node, Role]] = []
         with ExitStack() as cleanup:
             interrupts = cleanup.enter_context(noted())
+            cleanup.enter_context(self._raised(conductor, dict))
             if recorder is not None:
                 cleanup.callback(recorder.close)
             try:
@@ -140,6 +143,26 @@ class Run:
 
     def _mark_start(self) -> None:
         self._started_s = time.monotonic()
+
+    @contextmanager
+    def _raised(self, conductor: Conductor, pids: Callable[[], dict[str, int]]) -> Iterator[None]:
+        """From the start of the run on, the real-time priority that the scenario asks for; it ends with the block."""
+        priority, pacing = self._setup.scenario.clock.priority, conductor.pacing
+        if priority is None or pacing is None:
+            yield
+            return
+        priorities = Priorities(priority)
+        pacing.priorities = priorities.raised
+
+        def start() -> None:
+            self._mark_start()
+            priorities.raise_all({ORCHESTRATOR: os.getpid(), **pids()})
+
+        conductor.on_started = start
+        try:
+            yield
+        finally:
+            priorities.lower_own()
 
     def _recorder(self) -> Recorder | None:
         scenario, path = self._setup.scenario, self._out / "recording.mcap"

@@ -32,9 +32,17 @@ class Clock(Part):
         description="In real time, how long after u_k is due x̂_{k+1} is; a duration; left out: the period.",
     )
 
+    priority: int | None = Field(
+        default=None,
+        ge=1,
+        le=99,
+        description="In real time, the real-time priority (SCHED_FIFO) of the run's processes on this host, where the "
+        "system permits it; left out: none.",
+    )
+
     @model_validator(mode="after")
     def _real_only(self) -> "Clock":
-        for key in ("deadlines", "deadline"):
+        for key in ("deadlines", "deadline", "priority"):
             if self.mode == "virtual" and getattr(self, key) is not None:
                 raise problem(f"got {shown(getattr(self, key))}; allowed: only with mode 'real'", key)
         return self

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from testbed.orchestrator.report import csv_data, svg
 from testbed.orchestrator.report.derived import common_band, settled
-from testbed.orchestrator.report.figures import axes, covariance, excess, links, nees
+from testbed.orchestrator.report.figures import axes, covariance, excess, lateness, links, nees
 from testbed.orchestrator.report.figures.ratio import ratios
 from testbed.orchestrator.report.html import ENVIRONMENT, PageFigure, page_figure
 from testbed.orchestrator.report.link_model import Expected, expected_links
@@ -37,6 +37,7 @@ def report_html(summary: Summary, scenario_toml: str) -> str:
 def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageFigure]:
     """The figures that this run has something to show in, numbered in their order."""
     ran = summary.completed_steps > 0
+    realtime = summary.realtime
     has_estimators = ran and bool(summary.estimators)
     available: list[tuple[str, bool, Callable[[], Figure], Callable[[], str], str]] = [
         (
@@ -59,6 +60,13 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
             lambda: excess.draw(summary),
             lambda: csv_data.excess_csv(summary),
             "Squared error less claimed covariance along the steps",
+        ),
+        (
+            "lateness",
+            ran and realtime is not None,
+            lambda: lateness.draw(summary, realtime) if realtime is not None else Figure(),
+            lambda: csv_data.lateness_csv(summary.completed_steps, realtime) if realtime is not None else "",
+            "When the parts of each step were published, on the wall clock",
         ),
         (
             "links",
