@@ -95,9 +95,8 @@ def _realtime(realtime: RealTime) -> list[RenderableType]:
         cells = [text.ABSENT if value is None else text.count(round(value)) for value in values]
         cells += [text.count(stage.missed), text.count(stage.absent)]
         table.add_row(*(Text(cell) for cell in (topic.removeprefix("estimate/"), *cells)))
-    note = (
-        f"Deadline {text.count(round(realtime.deadline_us))} µs after t_k, when u of the step was due; {realtime.deadlines}."
-    )
+    deadline = text.count(round(realtime.deadline_us))
+    note = f"Deadline {deadline} µs after t_k, when u of the step was due; {realtime.deadlines}."
     return [table, Text(note, "dim")]
 
 
