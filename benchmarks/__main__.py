@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import codec, estimators, lanes, links, lockstep, streaming
+from benchmarks import codec, estimators, lanes, links, lockstep, realtime, streaming
 from benchmarks.figures import machine
 
 BENCHMARKS = {
@@ -19,6 +19,7 @@ BENCHMARKS = {
     "lanes": lanes.run,
     "estimators": estimators.run,
     "links": links.run,
+    "realtime": realtime.run,
 }
 
 

@@ -93,13 +93,16 @@ class Run:
             cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
             conductor = self._conductor(bus, recorder)
             bus.subscribe(conductor.node.keys.warm("*"), lambda _key, _payload: None)
-            threading.Thread(target=_import_report, daemon=True).start()
+            importing = threading.Thread(target=_import_report, daemon=True)
+            importing.start()
             for role in self._roles:
                 if role.name in external:
                     self._say(f"start {role.name} by hand: {shlex.join(self._by_hand(role, endpoint))}")
                 else:
                     supervisor.start(role, endpoint, self._setup.run, transport)
             conductor.collector.prepare()
+            if self._setup.real:
+                importing.join()  # it would take the interpreter from what is due
             with _settled_memory(), self._raised(conductor, lambda: supervisor.pids):
                 self._drive(conductor, bus, supervisor, interrupts, patient=bool(external))
             self._settle(conductor, bus)
