@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import random
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from orchestrator.runs import figures, recorded, run, scenario, tables
 from orchestrator.wall_clock import MS, Simulated
+from testbed.orchestrator.recording import read_recording
 from testbed.orchestrator.summary import Summary, read_summary
 
 STEPS = 20
@@ -37,9 +40,10 @@ def without_times(summary: Summary) -> dict[str, Any]:
         {"input": FEEDBACK},
         {"input": FEEDBACK, "transport": {"lanes_per_packet": 4}},
         {"lanes": 1, "record": "none"},
+        {"record": "first"},
         {"links": {**tables()["links"], "observation": {"delay": {"kind": "uniform", "low": "0 ms", "high": "30 ms"}}}},
     ],
-    ids=["open", "closed", "blocks", "one lane", "delays"],
+    ids=["open", "closed", "blocks", "one lane", "first lane recorded", "delays"],
 )
 def test_with_nothing_late_all_figures_are_those_of_virtual_time(tmp_path: Path, changes: dict[str, Any]) -> None:
     there = run(real(**changes), tmp_path / "real", network=Simulated)
@@ -53,6 +57,47 @@ def test_with_nothing_late_all_figures_are_those_of_virtual_time(tmp_path: Path,
         assert set(stage.published_us) <= {0.0, None}
         assert (stage.published.max, stage.arrived.max, stage.hop.max) == (0.0, 0.0, 0.0)
     assert read_summary(tmp_path / "real" / "summary.json") == there
+    if changes.get("record") != "none":
+        packets = [list(read_recording(tmp_path / mode / "recording.mcap")) for mode in ("real", "virtual")]
+        for one, other in zip(*map(in_order, packets), strict=True):
+            assert one == other
+
+
+def in_order(packets: list[Any]) -> list[Any]:
+    """What a recording says, whoever wrote first; the order on the bus is another in real time."""
+    found = [
+        (topic, packet.step, packet.lane, {name: array.tolist() for name, array in arrays.items()})
+        for topic, packet, arrays in packets
+    ]
+    return sorted(found, key=lambda one: one[:3])
+
+
+def test_a_recording_in_real_time_has_the_dates_of_publication(tmp_path: Path) -> None:
+    run(one_lane(), tmp_path, network=Simulated)
+    with (tmp_path / "recording.mcap").open("rb") as file:
+        controls = [m for _, channel, m in make_reader(file).iter_messages() if channel.topic == "control/sent"]
+    assert np.diff([message.publish_time for message in controls]).tolist() == [10 * MS] * (STEPS - 1)
+    assert [message.log_time for message in controls] == [10 * MS * k for k in range(STEPS)]
+
+
+def test_a_link_changes_at_the_step_that_is_told(tmp_path: Path) -> None:
+    """A command while the run goes holds from the first step that is not granted yet."""
+
+    class Commanded(Simulated):
+        told = 0
+
+        def before(self, key: str, number: int) -> bool:
+            if (key, number) == ("truth", 9):
+                question = b'{"link": "observation", "set": {"loss": {"kind": "bernoulli", "arrival": 0.0}}}'
+                ask = next(k for k in self._answers if k.endswith("/ask"))
+                Commanded.told = json.loads(self._answers[ask][1](question))["step"]
+            return True
+
+    summary = run(one_lane(steps=120, links={}), tmp_path, network=Commanded)
+    assert summary.status == "complete"
+    assert 10 + 45 <= Commanded.told <= 10 + 51  # half a second ahead, as of the last look at the clock
+    assert summary.links["observation"].delivered == Commanded.told - 1
+    assert [event.step for event in summary.events] == [Commanded.told]
 
 
 class Slow(Simulated):

@@ -193,7 +193,7 @@ class Conductor:
         if self.pacing is not None:
             self.pacing.note(topic, packet)
         if self._recorder is not None:
-            self._recorder.write(topic, packet, arrays, self.node.payload)
+            self._recorder.write(topic, packet, arrays, self.node.payload, self.node.bus.published_ns)
 
     def _presence(self, key: str, alive: bool) -> None:
         role = key.rsplit("/", 1)[1]

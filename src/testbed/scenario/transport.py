@@ -29,7 +29,7 @@ class Clock(Part):
     )
     deadline: Duration | None = Field(
         default=None,
-        description="In real time, how long after u_k is due x̂_{k+1} is; a duration; left out: the period.",
+        description="In real time, how long after u_k was due everything of step k + 1 is; left out: the period.",
     )
 
     priority: int | None = Field(
