@@ -51,7 +51,9 @@ def run(*, quick: bool) -> Figures:
 def _testbed(rate: int, seconds: float, priority: int | None) -> dict[str, Any] | None:
     """The quantiles of one run; None where the priority was refused."""
     given = scenario(steps=int(rate * seconds), record="none")
-    clock = {"mode": "real", "period": f"{1_000_000 // rate} us"} | ({"priority": priority} if priority else {})
+    clock = {"mode": "real", "period": f"{1_000_000 // rate} us", "window": given.steps} | (
+        {"priority": priority} if priority else {}
+    )
     given = given.model_copy(update={"clock": type(given.clock).model_validate(clock)})
     with tempfile.TemporaryDirectory(prefix="testbed-benchmark-") as folder:
         path, out = Path(folder) / "scenario.toml", Path(folder) / "out"

@@ -96,7 +96,7 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     ({"clock.deadlines": "soft"}, "clock.deadlines: got 'soft'; allowed: only with mode 'real'"),
     ({"clock.priority": 10}, "clock.priority: got 10; allowed: only with mode 'real'"),
-    ({"clock": {"mode": "real", "priority": 100}}, "clock.priority: got 100; allowed: 1 … 99"),
+    ({"clock": {"mode": "real", "priority": 100}}, "clock.priority: got 100; allowed: an integer, 1 … 99"),
     ({"clock.deadline": "5 ms"}, "clock.deadline: got '5 ms'; allowed: only with mode 'real'"),
     (
         {"clock": {"mode": "real", "deadlines": "strickt"}},
