@@ -39,11 +39,12 @@ def without_times(summary: Summary) -> dict[str, Any]:
         {},
         {"input": FEEDBACK},
         {"input": FEEDBACK, "transport": {"lanes_per_packet": 4}},
+        {"input": {"kind": "pid", "kp": 0.3, "ki": 0.1, "kd": 0.2, "high": 1.5}},
         {"lanes": 1, "record": "none"},
         {"record": "first"},
         {"links": {**tables()["links"], "observation": {"delay": {"kind": "uniform", "low": "0 ms", "high": "30 ms"}}}},
     ],
-    ids=["open", "closed", "blocks", "one lane", "first lane recorded", "delays"],
+    ids=["open", "closed", "blocks", "pid", "one lane", "first lane recorded", "delays"],
 )
 def test_with_nothing_late_all_figures_are_those_of_virtual_time(tmp_path: Path, changes: dict[str, Any]) -> None:
     there = run(real(**changes), tmp_path / "real", network=Simulated)

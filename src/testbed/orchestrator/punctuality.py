@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from testbed.channel.service import role_of as link_role
+from testbed.control.service import ROLE as CONTROLLER
 from testbed.estimator.service import role_of as estimator_role
 from testbed.orchestrator.realtime_figures import Quantiles, RealTime, Stage, quantiles
-from testbed.plant.controller import ROLE as CONTROLLER
 from testbed.plant.service import ROLE as PLANT
 from testbed.scenario import Scenario
 

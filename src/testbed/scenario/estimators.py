@@ -63,8 +63,13 @@ class EstimatorSpec(Part):
                 )
         own = {key: value for key, value in data.items() if key in cls.reserved}
         rest = {key: value for key, value in data.items() if key not in cls.model_fields}
-        own["options"] = {key: _plain_value(value, key) for key, value in {**given, **rest}.items()}
+        own["options"] = plain_options({**given, **rest})
         return own
+
+
+def plain_options(options: dict[str, Any]) -> dict[str, Any]:
+    """Options as TOML can hold them; a problem of validation if one is something else."""
+    return {key: _plain_value(value, key) for key, value in options.items()}
 
 
 def _plain_value(value: Any, at: str) -> Any:

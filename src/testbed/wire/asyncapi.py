@@ -44,7 +44,9 @@ def asyncapi() -> dict[str, Any]:
                 f"{schemas['description']} {schemas['x-bundle']} "
                 f"Transport: Eclipse Zenoh; a role is a client of the orchestrator's session. "
                 f"A query on {keys.scenario} is answered with JSON: the run's identity and its resolved scenario "
-                f"(TOML). A role declares its subscriptions, then the liveliness token {keys.presence('{role}')}; "
+                f"(TOML). A query on {keys.ask} with JSON, the link and the keys of its table to set, changes a link "
+                "while the run goes. A role declares its subscriptions, then the liveliness token "
+                f"{keys.presence('{role}')}; "
                 "the run starts when all are there. Each key has one sender; seq counts its messages from 0. What a "
                 f"role publishes on {keys.warm('{role}')} is read by nobody."
             ),

@@ -167,6 +167,9 @@ class ZenohBus:
         session = self._session
         return lambda payload: put(payload, timestamp=session.new_timestamp())
 
+    def call(self, order: Callable[[], None]) -> None:
+        self._inbox.put((_obey, order))
+
     def close(self) -> None:
         self.flush()
         self._session.close()  # type: ignore[no-untyped-call]
@@ -232,6 +235,10 @@ def _nothing(_: Any) -> None:
 def _keep_thread_state() -> None:
     """Of a thread that is not Python's: it would be made and freed in every call, and with it memory be mapped."""
     ctypes.pythonapi.PyGILState_Ensure()
+
+
+def _obey(order: Callable[[], None]) -> None:
+    order()
 
 
 def _raise(error: Exception) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from testbed.orchestrator.realtime_figures import RealTime
 from testbed.orchestrator.report.derived import relative_excess
 from testbed.orchestrator.report.link_model import Expected
-from testbed.orchestrator.summary import Series, Summary
+from testbed.orchestrator.summary import CostFigures, Series, Summary
 
 
 def covariance_csv(summary: Summary) -> str:
@@ -60,6 +60,12 @@ def excess_csv(summary: Summary) -> str:
 def lateness_csv(steps: int, realtime: RealTime) -> str:
     """Columns k; µs from the beginning of the step to the publication of each stage."""
     return _along_k(steps, {f"published_us:{topic}": stage.published_us for topic, stage in realtime.stages.items()})
+
+
+def cost_csv(cost: CostFigures, completed_steps: int) -> str:
+    """Columns k; the cost of a step, its two terms, and their standard errors."""
+    names = [f"{figure}_{kind}" for figure in ("step", "state", "input") for kind in ("mean", "stderr")]
+    return _along_k(completed_steps, {name: getattr(cost, name) for name in names})
 
 
 def links_csv(summary: Summary, expected: Mapping[str, Expected]) -> str:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 from matplotlib.figure import Figure
 
 from testbed.orchestrator.report import csv_data, svg
 from testbed.orchestrator.report.derived import common_band, settled
-from testbed.orchestrator.report.figures import axes, covariance, excess, lateness, links, nees
+from testbed.orchestrator.report.figures import axes, cost, covariance, excess, lateness, links, nees
 from testbed.orchestrator.report.figures.ratio import ratios
 from testbed.orchestrator.report.html import ENVIRONMENT, PageFigure, page_figure
 from testbed.orchestrator.report.link_model import Expected, expected_links
 from testbed.orchestrator.summary import Summary
+
+Part = TypeVar("Part")
 
 
 def report_html(summary: Summary, scenario_toml: str) -> str:
@@ -64,9 +67,16 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
         (
             "lateness",
             ran and realtime is not None,
-            lambda: lateness.draw(summary, realtime) if realtime is not None else Figure(),
-            lambda: csv_data.lateness_csv(summary.completed_steps, realtime) if realtime is not None else "",
+            lambda: lateness.draw(summary, _given(realtime)),
+            lambda: csv_data.lateness_csv(summary.completed_steps, _given(realtime)),
             "When the parts of each step were published, on the wall clock",
+        ),
+        (
+            "cost",
+            ran and summary.cost is not None,
+            lambda: cost.draw(_given(summary.cost), summary.completed_steps),
+            lambda: csv_data.cost_csv(_given(summary.cost), summary.completed_steps),
+            "Quadratic cost along the steps",
         ),
         (
             "links",
@@ -81,3 +91,8 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
         name: page_figure(number, name, draw, numbers(), label)
         for number, (name, _, draw, numbers, label) in enumerate(shown, start=1)
     }
+
+
+def _given(part: Part | None) -> Part:
+    assert part is not None
+    return part

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from testbed.numerics.lanes import Floats, array_of, constant, constant_times, vector_of
-from testbed.plant.inputs import open_loop
-from testbed.scenario import FeedbackInput
-from testbed.wire.messages import ClockMessage, Control, EstimateMessage
-from testbed.wire.node import ORCHESTRATOR, Node
+from testbed.control.service import ClosedLoopService, OpenLoopService
+from testbed.numerics.lanes import Floats
+from testbed.scenario import Following
+from testbed.wire.messages import ClockMessage, EstimateMessage
+from testbed.wire.node import Node
 from testbed.wire.setup import Setup
 
 
@@ -29,9 +29,9 @@ class Pace:
         self._start_ns: int | None = None
         self._granted = self._next = 0
         self._waiting = False
-        node.on(node.keys.clock, ClockMessage, ORCHESTRATOR, self._grant)
 
-    def _grant(self, clock: ClockMessage, _: dict[str, NDArray[Any]]) -> None:
+    def grant(self, clock: ClockMessage) -> None:
+        """Take what the orchestrator says of the clock."""
         if self._start_ns is None and clock.start_ns is not None:
             self._start_ns = self._bus.clock.monotonic_of(clock.start_ns)
         self._granted = min(clock.step, self._steps)
@@ -49,45 +49,49 @@ class Pace:
         self._wait()
 
 
-class PacedOpenLoop:
+class PacedOpenLoop(OpenLoopService):
     """Sends the input of the scenario in time."""
 
     def __init__(self, node: Node, setup: Setup) -> None:
-        self._sources = [(lane, lanes, open_loop(setup.scenario, lane, lanes)) for lane, lanes in setup.blocks]
-        self._send = node.sender(node.keys.sent("control"), Control, tap=True)
-        self.counters: dict[str, int] = {}
-        Pace(node, setup, self._act)
+        self._pace = Pace(node, setup, self._act)
+        super().__init__(node, setup)
+
+    def _tick(self, clock: ClockMessage, _: dict[str, NDArray[Any]]) -> None:
+        self._pace.grant(clock)
 
     def _act(self, k: int) -> None:
         for lane, lanes, source in self._sources:
             self._send(k, lane, lanes, {"u": source(k)})
 
 
-class PacedFeedback:
-    """u_k = −L x̂_j, x̂_j the newest estimate that has come when u_k is due: x̂_k where it was in time.
+class PacedClosedLoop(ClosedLoopService):
+    """u_k from the newest estimate that has come when u_k is due: that of k where it was in time; u_0 from the prior.
 
-    Until the first has come it is the prior mean. Counters: ``held`` packets sent with j < k, ``held_steps`` the
-    largest k − j.
+    The controller makes each step once, for k, and is given the older estimate as it is. Counters: ``held`` packets
+    sent with an estimate older than that of k, ``held_steps`` the largest age.
     """
 
-    def __init__(self, node: Node, setup: Setup, feedback: FeedbackInput) -> None:
-        self._gain = constant(-np.array(feedback.gain))
-        self._send = node.sender(node.keys.sent("control"), Control, tap=True)
-        prior = np.array(setup.scenario.system.x0_mean)
-        self._newest = {lane: (0, self._law(np.tile(prior, (lanes, 1)))) for lane, lanes in setup.blocks}
-        self.counters: dict[str, int] = {"held": 0, "held_steps": 0}
-        name = feedback.estimator
-        node.on(node.keys.estimate(name), EstimateMessage, f"estimator.{name}", self._follow)
-        Pace(node, setup, self._act)
+    def __init__(self, node: Node, setup: Setup, source: Following) -> None:
+        self._pace = Pace(node, setup, self._act)
+        system = setup.scenario.system
+        mean, covariance = np.array(system.x0_mean), np.array(system.P0)
+        self._newest: dict[int, tuple[int, Floats, Floats]] = {
+            lane: (0, np.tile(mean, (lanes, 1)), np.tile(covariance, (lanes, 1, 1))) for lane, lanes in setup.blocks
+        }
+        super().__init__(node, setup, source)
+        self.counters |= {"held": 0, "held_steps": 0}
 
-    def _law(self, x_hat: Floats) -> Floats:
-        return array_of(constant_times(self._gain, vector_of(x_hat)), len(x_hat))
+    def _tick(self, clock: ClockMessage, _: dict[str, NDArray[Any]]) -> None:
+        self._pace.grant(clock)
 
     def _follow(self, packet: EstimateMessage, arrays: dict[str, NDArray[Any]]) -> None:
-        self._newest[packet.lane] = (packet.step, self._law(arrays["x_hat"]))
+        self._newest[packet.lane] = packet.step, arrays["x_hat"], arrays["P"]
 
     def _act(self, k: int) -> None:
-        for lane, (step, u) in self._newest.items():
-            self._send(k, lane, len(u), {"u": u})
+        self._granted = k + 1
+        for lane, (step, x_hat, P) in self._newest.items():
+            if k > 0:
+                self._compute(k, lane, x_hat, P)
             self.counters["held"] += step < k
             self.counters["held_steps"] = max(self.counters["held_steps"], k - step)
+        self._send_ready()
