@@ -13,7 +13,9 @@ from mcap.reader import make_reader
 
 from orchestrator.runs import figures, recorded, run, scenario, tables
 from orchestrator.wall_clock import MS, Simulated
+from testbed.errors import UsageError
 from testbed.orchestrator.recording import read_recording
+from testbed.orchestrator.run import Run
 from testbed.orchestrator.summary import Summary, read_summary
 
 STEPS = 20
@@ -277,3 +279,13 @@ def test_the_estimator_learns_u_as_it_was_sent(tmp_path: Path) -> None:
     run(one_lane(input=table, record="all"), tmp_path / "open", network=Simulated)
     then = recorded(tmp_path / "open", 1, STEPS)
     assert np.array_equal(first["estimate/aoe"]["x_hat"], then["estimate/aoe"]["x_hat"])
+
+
+def test_links_that_keep_the_pace_themselves_are_refused(tmp_path: Path) -> None:
+    links = {"observation": {"backend": "relay"}}
+    with pytest.raises(UsageError) as refusal:
+        Run(one_lane(links=links), tmp_path).over_zenoh()
+    assert str(refusal.value) == (
+        "clock.mode: got 'real' with links.observation.backend 'relay', which keeps the pace itself; "
+        "allowed: virtual, or backend 'model'"
+    )
