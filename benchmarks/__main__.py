@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import codec, estimators, fidelity, lanes, links, lockstep, streaming
+from benchmarks import codec, estimators, fidelity, lanes, links, lockstep, realtime, streaming
 from benchmarks.figures import machine
 
 BENCHMARKS = {
@@ -23,6 +23,7 @@ BENCHMARKS = {
     "lanes": lanes.run,
     "estimators": estimators.run,
     "links": links.run,
+    "realtime": realtime.run,
     "fidelity": fidelity.run,
 }
 

@@ -87,6 +87,9 @@ SUMMARY_TABLES = (
     ("Happened", "`events[…]`", ""),
     ("Check", "`checks[…]`", ""),
     ("Timing", "`timing`", ""),
+    ("RealTime", "`realtime`", "Only in real time; see [Real time](../explanation/real-time.md)."),
+    ("Stage", "`realtime.stages.TOPIC`", ""),
+    ("Quantiles", "`realtime.stages.TOPIC.published` and the like", ""),
 )
 COMMON_FIELDS = ("v", "type", "run", "source", "seq")
 MEANINGS = {

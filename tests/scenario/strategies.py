@@ -160,8 +160,20 @@ acks = st.one_of(
     st.fixed_dictionaries({"mode": st.just("link")}, optional={"loss": losses}),
 )
 durations = st.builds("{} {}".format, st.integers(1, 10**6), st.sampled_from(["ns", "us", "ms", "s", "min"]))
-clocks = st.fixed_dictionaries(
-    {}, optional={"mode": st.just("virtual"), "period": durations, "window": st.integers(1, 100)}
+clocks = st.one_of(
+    st.fixed_dictionaries(
+        {}, optional={"mode": st.just("virtual"), "period": durations, "window": st.integers(1, 100)}
+    ),
+    st.fixed_dictionaries(
+        {"mode": st.just("real")},
+        optional={
+            "period": durations,
+            "window": st.integers(1, 100),
+            "deadlines": st.sampled_from(["soft", "strict"]),
+            "deadline": durations,
+            "priority": st.integers(1, 99),
+        },
+    ),
 )
 transports = st.fixed_dictionaries(
     {},

@@ -94,7 +94,22 @@ EXACT: list[tuple[dict[str, Any], str]] = [
         {"links.control.rate": {"bits_per_second": 0}},
         "links.control.rate.bits_per_second: got 0; allowed: more than 0, at most 1e+15",
     ),
-    ({"clock.mode": "real"}, "clock.mode: got 'real'; not supported by this version; allowed: virtual"),
+    ({"clock.deadlines": "soft"}, "clock.deadlines: got 'soft'; allowed: only with mode 'real'"),
+    ({"clock.priority": 10}, "clock.priority: got 10; allowed: only with mode 'real'"),
+    ({"clock": {"mode": "real", "priority": 100}}, "clock.priority: got 100; allowed: an integer, 1 … 99"),
+    ({"clock.deadline": "5 ms"}, "clock.deadline: got '5 ms'; allowed: only with mode 'real'"),
+    (
+        {"clock": {"mode": "real", "deadlines": "strickt"}},
+        "clock.deadlines: got 'strickt'; allowed: soft, strict; did you mean 'strict'?",
+    ),
+    (
+        {"clock": {"mode": "real", "deadline": "0 ms"}},
+        "clock.deadline: got '0 ms'; allowed: a whole number of nanoseconds, 1 … 2**63 - 1",
+    ),
+    (
+        {"clock": {"mode": "real", "period": 0.01}},
+        "clock.period: got 0.01; allowed: a duration with a unit (ns, us, ms, s, min), such as '10 ms'",
+    ),
     # model error
     (
         {"uncertainty": {}},
@@ -499,7 +514,7 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ({"record": "frist"}, "record: got 'frist'; allowed: first, all, none; did you mean 'first'?"),
     ({"bounds": 1}, "bounds: got 1; allowed: true or false"),
     ({"name": "a\nb"}, "name: got 'a\\nb'; allowed: a text of 1 to 128 characters, on one line"),
-    ({"clock.mode": "virtul"}, "clock.mode: got 'virtul'; allowed: virtual; did you mean 'virtual'?"),
+    ({"clock.mode": "virtul"}, "clock.mode: got 'virtul'; allowed: virtual, real; did you mean 'virtual'?"),
     ({"clock.window": 0}, "clock.window: got 0; allowed: an integer, 1 … 2147483647"),
     (
         {"clock.period": "10 sec"},

@@ -20,11 +20,13 @@ ROLE = "controller"
 
 
 def build(node: Node, setup: Setup) -> OpenLoopService | ClosedLoopService:
+    from testbed.control.paced import PacedClosedLoop, PacedOpenLoop
+
     source = setup.scenario.input
     if isinstance(source, ClosedLoop):
         assert isinstance(source, get_args(Following))
-        return ClosedLoopService(node, setup, source)
-    return OpenLoopService(node, setup)
+        return (PacedClosedLoop if setup.real else ClosedLoopService)(node, setup, source)
+    return (PacedOpenLoop if setup.real else OpenLoopService)(node, setup)
 
 
 class OpenLoopService:

@@ -18,6 +18,7 @@ from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.bounds_service import ROLE as BOUNDS
 from testbed.estimator.service import role_of as estimator_role
 from testbed.orchestrator.collect import Collector
+from testbed.orchestrator.pacing import Pacing
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.summary import Happened
 from testbed.plant.service import ROLE as PLANT
@@ -75,6 +76,7 @@ class Conductor:
         self.node = Node(bus, setup.run, ORCHESTRATOR, setup.sizes)
         self._clock, self._command = bus.publisher(self.node.keys.clock), bus.publisher(self.node.keys.command)
         self._clock_seq = 0
+        self.pacing = Pacing(bus, setup, self.collector, self._grant, self.fail) if setup.real else None
         self._tell_link = {link: bus.publisher(self.node.keys.change(link)) for link in get_args(LinkName)}
         self._changes: Counter[str] = Counter()
         self.events = [
@@ -169,7 +171,7 @@ class Conductor:
             node.on(keys.estimate(spec.name), EstimateMessage, estimator_role(spec.name), take, last=spec.until)
         if scenario.bounds:
             node.on(keys.bounds, BoundsMessage, BOUNDS, self._bounds)
-        if self._recorder is not None:
+        if self._recorder is not None or self.pacing is not None:
             self._subscribe_for_recording()
 
     def _subscribe_for_recording(self) -> None:
@@ -186,13 +188,15 @@ class Conductor:
                 self._record(keys.delivered(link), model, link_role(link), f"{link}/delivered")
 
     def _record(self, key: str, model: type[Packet], source: str, topic: str) -> None:
-        whole = self.setup.tap >= self.setup.sizes.lanes
+        whole = self.setup.real or self.setup.tap >= self.setup.sizes.lanes
         taken = key if whole else self.node.keys.tap(key)
         self.node.on(taken, model, source, partial(self._write, topic), cut=not whole)
 
     def _write(self, topic: str, packet: Packet, arrays: Arrays) -> None:
+        if self.pacing is not None:
+            self.pacing.note(topic, packet)
         if self._recorder is not None:
-            self._recorder.write(topic, packet, arrays, self.node.payload)
+            self._recorder.write(topic, packet, arrays, self.node.payload, self.node.bus.published_ns)
 
     def _presence(self, key: str, alive: bool) -> None:
         role = key.rsplit("/", 1)[1]
@@ -207,7 +211,10 @@ class Conductor:
         self.activity += 1
         if not self.missing and not self.started:
             self.on_started()
-            self._advance()
+            if self.pacing is not None:
+                self.pacing.begin()
+            else:
+                self._advance()
 
     def _status(self, role: str, status: Status, _: Arrays) -> None:
         self.reports[role] = status
@@ -232,11 +239,16 @@ class Conductor:
         self._advance()
 
     def _advance(self) -> None:
-        """Grant the steps that may be in flight, several at a time."""
+        """Grant the steps that may be in flight, several at a time; in real time the clock does."""
+        if self.pacing is not None:
+            return
         steps, credit = self._steps, self._credit
         target = min(steps, self.collector.estimated + credit)
         if target > self._granted and (target == steps or target - self._granted >= max(1, credit // 4)):
-            self._granted = target
-            clock = ClockMessage(run=self.setup.run, source=ORCHESTRATOR, seq=self._clock_seq, step=target)
-            self._clock_seq += 1
-            self._clock(encode(clock))
+            self._grant(target)
+
+    def _grant(self, step: int, start_ns: int | None = None) -> None:
+        self._granted = step
+        clock = ClockMessage(run=self.setup.run, source=ORCHESTRATOR, seq=self._clock_seq, step=step, start_ns=start_ns)
+        self._clock_seq += 1
+        self._clock(encode(clock))

@@ -22,6 +22,7 @@ from testbed.estimator.registry import model_of
 from testbed.estimator.service import role_of
 from testbed.numerics.lanes import constant
 from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.realtime_figures import RealTime
 from testbed.orchestrator.summary import (
     Z_95,
     BoundFigures,
@@ -39,6 +40,8 @@ from testbed.scenario import ClosedLoop, FeedbackInput, LqgInput, Scenario
 from testbed.wire.messages import Status
 from testbed.wire.node import ORCHESTRATOR
 
+_DATE_US = 100.0
+
 
 def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: Timing) -> Summary:
     """The summary of a run that is over, whole or not."""
@@ -53,6 +56,10 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
     complete = status == "complete"
     checks = [*moment_checks(scenario), *between_bounds(scenario, estimators, bounds)]
     checks += rounding(collector.largest_state, estimators)
+    pacing = conductor.pacing
+    realtime = None if pacing is None else pacing.figures(conductor.reports.get(CONTROLLER))
+    if realtime is not None:
+        checks += [*date_kept(realtime), *priority_granted(realtime)]
     if complete:
         checks += books(scenario, links, collector.applied)
     rejected = {role: dict(r.rejected) for role, r in sorted(conductor.reports.items()) if r.rejected}
@@ -77,9 +84,29 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
             "checks": checks,
             "rejected": rejected,
             "timing": timing,
+            "realtime": realtime,
             "versions": versions(),
         }
     )
+
+
+def date_kept(realtime: RealTime) -> list[Check]:
+    """A finding where the date was set during the run: publications are dated by it, and the pace is not."""
+    if abs(realtime.date_set_us) <= _DATE_US:
+        return []
+    text = (
+        f"the date was set by {realtime.date_set_us / 1e3:.3g} ms during the run: the pace was kept, but the times "
+        "in `realtime` are wrong by up to that much, and so are the deadlines counted as missed"
+    )
+    return [Check(name="date", ok=False, text=text)]
+
+
+def priority_granted(realtime: RealTime) -> list[Check]:
+    """Whether the system granted the real-time priority that was asked for."""
+    if realtime.priority is None:
+        return []
+    granted = f"SCHED_FIFO {realtime.priority} for {', '.join(realtime.priorities) or 'no process'}"
+    return [Check(name="priority", ok=bool(realtime.priorities), text=granted)]
 
 
 def link_figures(counters: dict[str, int]) -> LinkFigures:
@@ -242,12 +269,13 @@ def _controller(conductor: Conductor) -> ControllerFigures | None:
     gain = source.gain if isinstance(source, FeedbackInput) else None
     if isinstance(source, LqgInput):
         gain = constant(lqg_gains(source, model_of(scenario), scenario.steps)[-1])
+    counters = conductor.reports.get(CONTROLLER, _SILENT).counters
     return ControllerFigures(
         kind=source.kind,
         estimator=source.estimator,
         gain=gain,
         statement=statement(scenario),
-        counters=conductor.reports.get(CONTROLLER, _SILENT).counters,
+        counters={name: n for name, n in counters.items() if not name.startswith("held")},  # those are in `realtime`
     )
 
 

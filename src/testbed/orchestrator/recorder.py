@@ -1,7 +1,7 @@
 """The recording: every packet and estimate of the recorded lanes, as an MCAP file.
 
 Topics are the keys without the run; messages are payloads as they were on the bus, in the format that ``testbed schema
-messages`` describes; log time is virtual time in nanoseconds.
+messages`` describes; log time is virtual time in nanoseconds, and so is publish time, which in real time is the date.
 """
 
 from __future__ import annotations
@@ -33,8 +33,13 @@ class Recorder:
         self._definitions = messages_json_schema()["$defs"]
         self.messages = 0
 
-    def write(self, topic: str, packet: Packet, arrays: dict[str, NDArray[Any]], payload: bytes) -> None:
-        """Record one packet, cut to the recorded lanes; ``payload``: the message as it came."""
+    def write(
+        self, topic: str, packet: Packet, arrays: dict[str, NDArray[Any]], payload: bytes, date_ns: int = 0
+    ) -> None:
+        """Record one packet, cut to the recorded lanes.
+
+        payload: the message as it came. date_ns: when it was published; 0 in virtual time.
+        """
         if packet.lane >= self._lanes:
             return
         kept = min(packet.lanes, self._lanes - packet.lane)
@@ -43,7 +48,9 @@ class Recorder:
             packet = packet.model_copy(update={"lanes": kept, "arrays": entries_of(arrays)})
             payload = encode(packet, arrays)
         time_ns = packet.step * self._period_ns
-        self._writer.add_message(self._channel(topic, packet.type), time_ns, payload, time_ns, packet.seq % 2**32)
+        self._writer.add_message(
+            self._channel(topic, packet.type), time_ns, payload, date_ns or time_ns, packet.seq % 2**32
+        )
         self.messages += 1
 
     def close(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import secrets
 import shlex
 import threading
@@ -21,6 +22,7 @@ from testbed.orchestrator.lanes_file import NAME as LANES
 from testbed.orchestrator.lanes_file import LaneFigures, write_lanes
 from testbed.orchestrator.outcome import summarise
 from testbed.orchestrator.preflight import check_parts, check_processes, prepare_folder
+from testbed.orchestrator.priority import Priorities
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.roles import RoleSpec, roles_of
 from testbed.orchestrator.running import published
@@ -29,7 +31,7 @@ from testbed.orchestrator.summary import Summary, Timing, write_summary
 from testbed.orchestrator.supervise import Supervisor, command_of
 from testbed.scenario import Scenario, to_toml
 from testbed.wire.memory_bus import MemoryNetwork
-from testbed.wire.node import Node
+from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.process import settle_memory
 from testbed.wire.setup import Role, Setup
 
@@ -90,18 +92,22 @@ class Run:
             if recorder is not None:
                 cleanup.callback(recorder.close)
             cleanup.callback(supervisor.close, 0.0)
-            bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.window == 1)
+            bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.express)
+            bus.timed = self._setup.real
             cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
             conductor = self._conductor(bus, recorder)
             bus.subscribe(conductor.node.keys.warm("*"), lambda _key, _payload: None)
-            threading.Thread(target=_import_report, daemon=True).start()
+            importing = threading.Thread(target=_import_report, daemon=True)
+            importing.start()
             for role in self._roles:
                 if role.name in external:
                     self._say(f"start {role.name} by hand: {shlex.join(self._by_hand(role, endpoint))}")
                 else:
                     supervisor.start(role, endpoint, self._setup.run, transport)
             conductor.collector.prepare()
-            with _settled_memory():
+            if self._setup.real:
+                importing.join()  # it would take the interpreter from what is due
+            with _settled_memory(), self._raised(conductor, lambda: supervisor.pids):
                 self._drive(conductor, bus, supervisor, interrupts, patient=bool(external))
             self._settle(conductor, bus)
             supervisor.close(_LEAVE_S if conductor.collector.finished else 0.2)
@@ -114,17 +120,18 @@ class Run:
         Raises UsageError where a link needs real time and processes.
         """
         check_processes(self._setup.scenario)
-        network = MemoryNetwork(schedule)
+        network = MemoryNetwork(schedule, timed=self._setup.real)
         recorder = self._recorder()
         conductor = self._conductor(network.bus(), recorder)
         nodes: list[tuple[Node, Role]] = []
         with ExitStack() as cleanup:
             interrupts = cleanup.enter_context(noted())
+            cleanup.enter_context(self._raised(conductor, dict))
             if recorder is not None:
                 cleanup.callback(recorder.close)
             try:
                 for spec in self._roles:
-                    node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.tap)
+                    node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.copied)
                     nodes.append((node, spec.build(node, self._setup)))
                     node.announce()
                 while not conductor.over and not interrupts.asked:
@@ -147,6 +154,26 @@ class Run:
 
     def _mark_start(self) -> None:
         self._started_s = time.monotonic()
+
+    @contextmanager
+    def _raised(self, conductor: Conductor, pids: Callable[[], dict[str, int]]) -> Iterator[None]:
+        """From the start of the run on, the real-time priority that the scenario asks for; it ends with the block."""
+        priority, pacing = self._setup.scenario.clock.priority, conductor.pacing
+        if priority is None or pacing is None:
+            yield
+            return
+        priorities = Priorities(priority)
+        pacing.priorities = priorities.raised
+
+        def start() -> None:
+            self._mark_start()
+            priorities.raise_all({ORCHESTRATOR: os.getpid(), **pids()})
+
+        conductor.on_started = start
+        try:
+            yield
+        finally:
+            priorities.lower_own()
 
     def _recorder(self) -> Recorder | None:
         scenario, path = self._setup.scenario, self._out / "recording.mcap"

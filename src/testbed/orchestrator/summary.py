@@ -27,6 +27,7 @@ from pydantic import (
 )
 
 from testbed.errors import UsageError
+from testbed.orchestrator.realtime_figures import RealTime
 
 Z_95 = 1.96
 """Half-width of a 95 % interval in standard errors, wherever a figure shows one."""
@@ -214,6 +215,9 @@ class Summary(_Model):
         default_factory=dict, description="messages refused, by role and reason"
     )
     timing: Timing = Timing()
+    realtime: RealTime | None = Field(
+        default=None, description="how the run kept to the wall clock; null in virtual time"
+    )
     versions: dict[str, str] = Field(default_factory=dict)
 
     @model_validator(mode="after")

@@ -43,6 +43,11 @@ class Supervisor:
     def log_of(self, role: str) -> Path:
         return self._logs / f"{role}.log"
 
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids by role."""
+        return {role: process.pid for role, process in self._processes.items()}
+
     def dead(self) -> dict[str, str]:
         """How each process that has ended did so: role → "killed by SIGKILL", "exit code 1"."""
         return {role: _ending(p.returncode) for role, p in self._processes.items() if p.poll() is not None}

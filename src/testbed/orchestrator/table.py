@@ -8,6 +8,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from testbed.orchestrator.realtime_figures import RealTime
 from testbed.orchestrator.report import text
 from testbed.orchestrator.report.derived import common_band, settled
 from testbed.orchestrator.summary import CostFigures, Summary
@@ -27,6 +28,8 @@ def end_table(summary: Summary, directory: Path) -> RenderableType:
         parts.append(_cost(summary, summary.cost))
     if summary.links:
         parts.append(_links(summary))
+    if summary.realtime is not None:
+        parts += _realtime(summary.realtime)
     parts += [_line("not ok", f"{check.name}: {check.text}", "bold yellow") for check in summary.checks if not check.ok]
     for role, reasons in summary.rejected.items():
         counts = ", ".join(f"{count} × {reason}" for reason, count in reasons.items())
@@ -95,6 +98,19 @@ def _links(summary: Summary) -> Table:
         cells = [name, *map(text.count, counts), text.number(link.loss_rate)]
         table.add_row(*(Text(cell) for cell in cells))
     return table
+
+
+def _realtime(realtime: RealTime) -> list[RenderableType]:
+    table = _table("µs after t_k", "50 %", "90 %", "99 %", "largest", "missed", "absent")
+    stages = {topic: stage for topic, stage in realtime.stages.items() if topic.startswith(("control/sent", "estim"))}
+    for topic, stage in stages.items():
+        values = (stage.published.p50, stage.published.p90, stage.published.p99, stage.published.max)
+        cells = [text.ABSENT if value is None else text.count(round(value)) for value in values]
+        cells += [text.count(stage.missed), text.count(stage.absent)]
+        table.add_row(*(Text(cell) for cell in (topic.removeprefix("estimate/"), *cells)))
+    deadline = text.count(round(realtime.deadline_us))
+    note = f"Deadline {deadline} µs after t_k, when u of the step was due; {realtime.deadlines}."
+    return [table, Text(note, "dim")]
 
 
 def _table(first: str, *others: str) -> Table:

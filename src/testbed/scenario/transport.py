@@ -3,34 +3,64 @@
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from testbed.scenario.base import Count, Part, problem, shown
 from testbed.scenario.durations import Duration, parse_duration
 
 
 class Clock(Part):
-    """How time passes. `period_ns` is the period in nanoseconds."""
+    """How time passes. `period_ns` is the period in nanoseconds, `deadline_ns` the deadline of a step."""
 
-    mode: Literal["virtual"] = Field(
-        default="virtual", description="virtual: simulated time, as fast as the processes can go."
+    mode: Literal["virtual", "real"] = Field(
+        default="virtual",
+        description="virtual: simulated time, as fast as the processes can go; real: the wall clock keeps the period.",
     )
-    period: Duration = Field(default="10 ms", description="Simulated time of one step, a duration such as '10 ms'.")
+    period: Duration = Field(default="10 ms", description="Time of one step, a duration such as '10 ms'.")
     window: Count | None = Field(
-        default=None, description="Steps that may be in flight at once, 1 or more; left out: chosen by the run."
+        default=None,
+        description="Steps that may be in flight at once, 1 or more; in real time more than that behind the wall "
+        "clock end the run; left out: chosen by the run.",
+    )
+    deadlines: Literal["soft", "strict"] | None = Field(
+        default=None,
+        description="In real time, what a missed deadline does; soft: it is counted; strict: it ends the run; left "
+        "out: soft.",
+    )
+    deadline: Duration | None = Field(
+        default=None,
+        description="In real time, how long after u_k was due everything of step k + 1 is; left out: the period.",
     )
 
-    @field_validator("mode", mode="before")
-    @classmethod
-    def _not_yet_real(cls, mode: object) -> object:
-        if mode == "real":
-            raise problem("got 'real'; not supported by this version; allowed: virtual")
-        return mode
+    priority: int | None = Field(
+        default=None,
+        ge=1,
+        le=99,
+        description="In real time, the real-time priority (SCHED_FIFO) of the run's processes on this host, where the "
+        "system permits it; left out: none.",
+    )
+
+    @model_validator(mode="after")
+    def _real_only(self) -> "Clock":
+        for key in ("deadlines", "deadline", "priority"):
+            if self.mode == "virtual" and getattr(self, key) is not None:
+                raise problem(f"got {shown(getattr(self, key))}; allowed: only with mode 'real'", key)
+        return self
+
+    @property
+    def real(self) -> bool:
+        """Whether the wall clock keeps the period."""
+        return self.mode == "real"
 
     @property
     def period_ns(self) -> int:
         """The period in nanoseconds."""
         return parse_duration(self.period)
+
+    @property
+    def deadline_ns(self) -> int:
+        """What of a step comes later than so many nanoseconds after its control was due is late."""
+        return parse_duration(self.deadline or self.period)
 
 
 class Tls(Part):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from testbed.errors import TestbedError
+from testbed.wire.timers import WallClock
 
 Handler = Callable[[str, bytes], None]
 """Called with (key, payload)."""
@@ -22,6 +23,23 @@ class BusError(TestbedError):
 
 class Bus(Protocol):
     """Handlers run on the thread that calls ``run``, one at a time, in the order of arrival."""
+
+    @property
+    def clock(self) -> WallClock: ...
+
+    @property
+    def published_ns(self) -> int:
+        """The date at which the message that is being handled was published; 0 where the bus is not ``timed``."""
+        ...
+
+    @property
+    def arrived_ns(self) -> int:
+        """The date at which it arrived here; 0 where the bus is not ``timed``."""
+        ...
+
+    def at(self, due_ns: int, call: Callable[[], None]) -> None:
+        """Make a call once the monotonic clock has come so far, never before, between two messages."""
+        ...
 
     def publisher(self, key: str, *, lazy: bool = False) -> Publish:
         """A function that publishes on ``key``. Order is kept on each key; nothing is lost.

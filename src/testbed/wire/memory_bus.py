@@ -8,14 +8,22 @@ from collections.abc import Callable
 from functools import partial
 
 from testbed.wire.bus import Answer, BusError, Handler, PresenceHandler, Publish
+from testbed.wire.timers import Timers, WallClock
+
+_SLEEP_MAX_S = 0.1  # so that who steps the network can look around
 
 
 class MemoryNetwork:
     """Delivers messages one at a time: in the order of publication, or, with a seed, interleaved at random over the
     receivers while each receiver still gets its own in order (what a real network may do).
+
+    timed: messages carry when they were published. Calls that are due come before messages; where no message waits, the
+    network sleeps until the next call is due.
     """
 
-    def __init__(self, seed: int | None = None) -> None:
+    def __init__(self, seed: int | None = None, *, timed: bool = False, clock: WallClock | None = None) -> None:
+        self.clock, self.timed = clock or WallClock(), timed
+        self.timers = Timers(self.clock)
         self._random = None if seed is None else random.Random(seed)
         self._order: deque[MemoryBus] = deque()
         self._subscribers: list[tuple[str, MemoryBus, Handler]] = []
@@ -29,9 +37,15 @@ class MemoryNetwork:
         return MemoryBus(self)
 
     def step(self) -> bool:
-        """Deliver one message; False if none is waiting."""
+        """Deliver one message, or make the calls that are due; False if there is nothing to wait for."""
+        if self.timers.fire():
+            return True
         if not self._order:
-            return False
+            wait_s = self.timers.wait_s
+            if wait_s == float("inf"):
+                return False
+            self.clock.sleep(min(wait_s, _SLEEP_MAX_S))
+            return True
         if self._random is not None:
             self._order.rotate(self._random.randrange(len(self._order)))
         self._order.popleft().deliver_one()
@@ -53,6 +67,11 @@ class MemoryNetwork:
         if route is None:
             route = [(bus, handler) for pattern, bus, handler in self._subscribers if matches(pattern, key)]
             self._routes[key] = route
+        if self.timed:
+            date_ns = self.clock.date_ns()
+            for bus, handler in route:
+                self._enqueue(bus, partial(bus.take_timed, handler, key, payload, date_ns))
+            return
         for bus, handler in route:
             self._enqueue(bus, partial(handler, key, payload))
 
@@ -83,6 +102,18 @@ class MemoryBus:
     def __init__(self, network: MemoryNetwork) -> None:
         self._network = network
         self.inbox: deque[Callable[[], None]] = deque()
+        self.published_ns = self.arrived_ns = 0
+
+    @property
+    def clock(self) -> WallClock:
+        return self._network.clock
+
+    def at(self, due_ns: int, call: Callable[[], None]) -> None:
+        self._network.timers.at(due_ns, call)
+
+    def take_timed(self, handler: Handler, key: str, payload: bytes, published_ns: int) -> None:
+        self.published_ns, self.arrived_ns = published_ns, self.clock.date_ns()
+        handler(key, payload)
 
     def deliver_one(self) -> None:
         self.inbox.popleft()()

@@ -166,10 +166,17 @@ class BoundsMessage(Packet):
 
 
 class ClockMessage(Message):
-    """Virtual time may advance until step ``step`` is complete."""
+    """Time may advance until step ``step`` is complete; in real time: until then, as the wall clock goes."""
 
     type: Literal["clock"] = "clock"
     step: Count
+    start_ns: Annotated[
+        Count | None,
+        Field(
+            description="in real time: when u_0 is due, nanoseconds since 1970 (UTC), the same in all messages; u_k is "
+            "due k periods later; in virtual time: null"
+        ),
+    ] = None
 
 
 class Command(Message):

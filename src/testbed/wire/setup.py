@@ -17,6 +17,9 @@ _WINDOW_MAX = 256
 _BYTES_IN_FLIGHT = 24_000_000
 _REAL_WINDOW = 8  # steps
 _CLOSED_LOOP_CREDIT = 64  # steps
+_BYTES_BEHIND = 1_000_000  # less than what waits for a process that has stopped before its senders do
+_MESSAGE_OVERHEAD = 250  # bytes
+_AHEAD_NS = 500_000_000
 _DIRECT_MAX = 8_192  # bytes
 _SHARED_MIN = 65_536  # bytes of the largest packet from which shared memory pays
 
@@ -48,8 +51,11 @@ class Setup:
     def window(self) -> int:
         """Steps in flight at most: 1 in a closed loop; else the scenario's, or as many as fit into a few megabytes.
 
-        In real time a few are enough, and what is known of them is not to wait behind what is to be sent later.
+        Over real links a few are enough, and what is known of them is not to wait behind what is to be sent later. In
+        real time: steps that may have been due and are not complete, which does not hold back the clock.
         """
+        if self.real:
+            return self.scenario.clock.window or self._behind
         if self.closed_loop:
             return 1
         if self.scenario.clock.window is not None:
@@ -61,9 +67,32 @@ class Setup:
         return max(4, min(_WINDOW_MAX, _BYTES_IN_FLIGHT // bytes_a_step))
 
     @property
+    def real(self) -> bool:
+        """Whether the wall clock keeps the period."""
+        return self.scenario.clock.real
+
+    @cached_property
+    def _behind(self) -> int:
+        """As many steps as fit into the deadline of the transport, and into the buffers before one that sleeps."""
+        n, p, q = self.sizes.n, self.sizes.p, self.sizes.q
+        bytes_a_step = 8 * self.scenario.lanes * max(p + q + 1, n + n * n) + 3 * _MESSAGE_OVERHEAD * len(self.blocks)
+        in_time = self.scenario.transport.deadline_ns // self.scenario.clock.period_ns
+        return max(4, min(in_time, _BYTES_BEHIND // bytes_a_step))
+
+    @property
+    def ahead(self) -> int:
+        """In real time: steps that are granted before they are due."""
+        return max(2, -(-_AHEAD_NS // self.scenario.clock.period_ns))
+
+    @property
     def credit(self) -> int:
         """Steps that the clock grants ahead: in a closed loop the estimate holds back the next step, not the clock."""
         return _CLOSED_LOOP_CREDIT if self.closed_loop else self.window
+
+    @property
+    def express(self) -> bool:
+        """Whether each message is sent at once instead of with others."""
+        return self.real or self.window == 1
 
     @property
     def direct(self) -> bool:
@@ -71,7 +100,7 @@ class Setup:
 
         A thread hand-over less; but a role that sends does not receive meanwhile.
         """
-        return self.window == 1 and len(self.blocks) == 1 and self._largest <= _DIRECT_MAX
+        return self.express and len(self.blocks) == 1 and self._largest <= _DIRECT_MAX
 
     @property
     def _largest(self) -> int:
@@ -91,6 +120,11 @@ class Setup:
     def tap(self) -> int:
         """Lanes whose packets are recorded."""
         return {"none": 0, "first": 1, "all": self.scenario.lanes}[self.scenario.record]
+
+    @property
+    def copied(self) -> int:
+        """Lanes whose packets roles copy for the recording; in real time the orchestrator sees all packets anyway."""
+        return 0 if self.real else self.tap
 
     @property
     def acks_are_of_use(self) -> bool:

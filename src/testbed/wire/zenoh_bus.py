@@ -15,6 +15,7 @@ import zenoh
 
 from testbed.wire.bundle import bundle
 from testbed.wire.bus import Answer, BusError, Handler, PresenceHandler, Publish
+from testbed.wire.timers import Timers, WallClock
 
 INBOX_MAX = 65536
 """Messages waiting in a process beyond which its receiving thread pauses, and zenoh holds back the senders."""
@@ -45,12 +46,16 @@ class ZenohBus:
 
     express: send each message at once instead of batching; right when only one is in flight. direct: handle messages
     on the thread that receives them, while ``run`` waits for everything else; right for small messages of which one is
-    in flight, in a client, whose messages all come over one link. Both count for what is declared afterwards.
+    in flight, in a client, whose messages all come over one link. timed: messages carry when they were published, as
+    zenoh's timestamps, and nothing is held back. All count for what is declared afterwards.
     """
 
     def __init__(self, session: zenoh.Session, *, deadline_s: float = 10.0, express: bool = False) -> None:
         self._session, self._deadline_s, self.express = session, deadline_s, express
-        self.direct = False
+        self.direct = self.timed = False
+        self.published_ns = self.arrived_ns = 0
+        self.clock = WallClock()
+        self._timers = Timers(self.clock)
         self._lock = threading.Lock()
         self._failed = False
         self._inbox: queue.SimpleQueue[tuple[Callable[..., None], Any]] = queue.SimpleQueue()
@@ -59,18 +64,25 @@ class ZenohBus:
         self._handling = False
 
     def run(self, timeout_s: float) -> bool:
-        """Handle what has arrived, waiting up to ``timeout_s`` for the first; False if nothing came."""
+        """Handle what has arrived, waiting up to ``timeout_s`` for the first; False if nothing came.
+
+        Calls that are due come first.
+        """
         try:
             handle, event = self._inbox.get(timeout=self._patience_s(timeout_s))
         except queue.Empty:
             self.flush()
-            return False
+            handle, event = _nothing, None
         with self._lock:
             self._handling = True
             try:
+                fired = self._timers.fire()
+                if handle is _nothing and not fired:
+                    return False
                 handle(event)
                 for _ in range(min(self._inbox.qsize(), _AT_ONCE)):
                     handle, event = self._inbox.get_nowait()
+                    self._timers.fire()
                     handle(event)
             finally:
                 self._handling = False
@@ -82,6 +94,10 @@ class ZenohBus:
         with self._lock:
             self._send(lazy=True)
 
+    def at(self, due_ns: int, call: Callable[[], None]) -> None:
+        self._timers.at(due_ns, call)
+        self._inbox.put((_nothing, None))  # who waits on another thread is to look again
+
     def publisher(self, key: str, *, lazy: bool = False) -> Publish:
         publisher = self._session.declare_publisher(
             key,
@@ -91,6 +107,8 @@ class ZenohBus:
         )
         self._declared.append(publisher)
         put: Publish = publisher.put
+        if self.timed:
+            return self._timed_put(put)
         waiting: list[bytes] = []
         self._outbox.append(_Outgoing(put, waiting, lazy))
 
@@ -109,8 +127,16 @@ class ZenohBus:
         def handle(sample: Any) -> None:
             handler(str(sample.key_expr) if "*" in key else key, sample.payload.to_bytes())
 
-        receive = self._at_once(handle) if self.direct else self._into_inbox(handle)
-        self._declared.append(self._session.declare_subscriber(key, receive))
+        def handle_timed(arrived: tuple[int, Any]) -> None:
+            self.arrived_ns, sample = arrived
+            stamp = sample.timestamp
+            self.published_ns = self.arrived_ns if stamp is None else stamp.get_time_as_ntp64().as_nanos()
+            handle(sample)
+
+        receive = (self._at_once if self.direct else self._into_inbox)(handle_timed if self.timed else handle)
+        if self.timed:
+            receive = _with_arrival(receive)
+        self._declared.append(self._session.declare_subscriber(key, _calling(receive)))
 
     def ask(self, key: str, question: bytes = b"") -> bytes:
         replies = self._session.get(key, payload=question, timeout=self._deadline_s)
@@ -125,7 +151,7 @@ class ZenohBus:
             with query:
                 query.reply(key, answer(query.payload.to_bytes() if query.payload is not None else b""))
 
-        self._declared.append(self._session.declare_queryable(key, self._into_inbox(reply)))
+        self._declared.append(self._session.declare_queryable(key, _calling(self._into_inbox(reply))))
 
     def announce(self, key: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(key))
@@ -135,7 +161,11 @@ class ZenohBus:
             handler(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         liveliness = self._session.liveliness()
-        self._declared.append(liveliness.declare_subscriber(key, self._into_inbox(handle), history=True))
+        self._declared.append(liveliness.declare_subscriber(key, _calling(self._into_inbox(handle)), history=True))
+
+    def _timed_put(self, put: Callable[..., None]) -> Publish:
+        session = self._session
+        return lambda payload: put(payload, timestamp=session.new_timestamp())
 
     def call(self, order: Callable[[], None]) -> None:
         self._inbox.put((_obey, order))
@@ -156,9 +186,9 @@ class ZenohBus:
 
     def _patience_s(self, timeout_s: float) -> float:
         held_back = self.direct or any(outgoing.waiting for outgoing in self._outbox)
-        return min(timeout_s, _IDLE_S) if held_back else timeout_s
+        return min(timeout_s, self._timers.wait_s, _IDLE_S if held_back else timeout_s)
 
-    def _at_once(self, handle: Callable[..., None]) -> Any:
+    def _at_once(self, handle: Callable[..., None]) -> Callable[[Any], None]:
         inbox, lock = self._inbox, self._lock
         known: set[int] = set()
 
@@ -176,9 +206,9 @@ class ZenohBus:
                     self._failed = True
                     inbox.put((_raise, error))
 
-        return zenoh.handlers.Callback(take, indirect=False)
+        return take
 
-    def _into_inbox(self, handle: Callable[..., None]) -> Any:
+    def _into_inbox(self, handle: Callable[..., None]) -> Callable[[Any], None]:
         inbox = self._inbox
 
         def put(event: Any) -> None:
@@ -186,7 +216,20 @@ class ZenohBus:
                 time.sleep(0.001)
             inbox.put((handle, event))
 
-        return zenoh.handlers.Callback(put, indirect=False)
+        return put
+
+
+def _calling(receive: Callable[[Any], None]) -> Any:
+    """A handler for zenoh that calls on the thread which receives."""
+    return zenoh.handlers.Callback(receive, indirect=False)
+
+
+def _with_arrival(receive: Callable[[Any], None]) -> Callable[[Any], None]:
+    return lambda sample: receive((time.time_ns(), sample))
+
+
+def _nothing(_: Any) -> None:
+    pass
 
 
 def _keep_thread_state() -> None:

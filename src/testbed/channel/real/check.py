@@ -15,6 +15,12 @@ from testbed.scenario.links import SteppedImpairments
 def check_links(scenario: Scenario) -> None:
     """Raises UsageError for a link that its backend cannot do, on this machine or at all."""
     names = real_links(scenario)
+    if names and scenario.clock.real:
+        backend = getattr(scenario.links, names[0]).backend
+        raise UsageError(
+            f"clock.mode: got 'real' with links.{names[0]}.backend {backend!r}, which keeps the pace itself; allowed: "
+            "virtual, or backend 'model'"
+        )
     for name in names:
         for variant in scenario.variants(name):
             check_link(scenario, name, variant)

@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
 
+from testbed.orchestrator.realtime_figures import RealTime
 from testbed.orchestrator.report.derived import relative_excess
 from testbed.orchestrator.report.link_model import Expected
 from testbed.orchestrator.summary import CostFigures, Series, Summary
@@ -54,6 +55,11 @@ def excess_csv(summary: Summary) -> str:
         columns[f"relative_excess_mean:{name}"] = tuple(_finite(mean.tolist()))
         columns[f"relative_excess_stderr:{name}"] = tuple(_finite(stderr.tolist()))
     return _along_k(summary.completed_steps, columns)
+
+
+def lateness_csv(steps: int, realtime: RealTime) -> str:
+    """Columns k; µs from the beginning of the step to the publication of each stage."""
+    return _along_k(steps, {f"published_us:{topic}": stage.published_us for topic, stage in realtime.stages.items()})
 
 
 def cost_csv(cost: CostFigures, completed_steps: int) -> str:

@@ -18,7 +18,7 @@ ENVIRONMENT = jinja2.Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-ENVIRONMENT.filters.update(number=text.number, count=text.count, share=text.share, band=text.band)
+ENVIRONMENT.filters.update(number=text.number, count=text.count, share=text.share, band=text.band, micros=text.micros)
 ENVIRONMENT.globals.update(plus_minus=text.plus_minus, plural=text.plural, steps_range=text.steps)
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 from matplotlib.figure import Figure
 
 from testbed.orchestrator.report import csv_data, svg
 from testbed.orchestrator.report.derived import common_band, settled
-from testbed.orchestrator.report.figures import axes, cost, covariance, excess, links, nees
+from testbed.orchestrator.report.figures import axes, cost, covariance, excess, lateness, links, nees
 from testbed.orchestrator.report.figures.ratio import ratios
 from testbed.orchestrator.report.html import ENVIRONMENT, PageFigure, page_figure
 from testbed.orchestrator.report.link_model import Expected, expected_links
-from testbed.orchestrator.summary import CostFigures, Summary
+from testbed.orchestrator.summary import Summary
+
+Part = TypeVar("Part")
 
 
 def report_html(summary: Summary, scenario_toml: str) -> str:
@@ -37,6 +40,7 @@ def report_html(summary: Summary, scenario_toml: str) -> str:
 def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageFigure]:
     """The figures that this run has something to show in, numbered in their order."""
     ran = summary.completed_steps > 0
+    realtime = summary.realtime
     has_estimators = ran and bool(summary.estimators)
     available: list[tuple[str, bool, Callable[[], Figure], Callable[[], str], str]] = [
         (
@@ -61,6 +65,13 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
             "Squared error less claimed covariance along the steps",
         ),
         (
+            "lateness",
+            ran and realtime is not None,
+            lambda: lateness.draw(summary, _given(realtime)),
+            lambda: csv_data.lateness_csv(summary.completed_steps, _given(realtime)),
+            "When the parts of each step were published, on the wall clock",
+        ),
+        (
             "cost",
             ran and summary.cost is not None,
             lambda: cost.draw(_given(summary.cost), summary.completed_steps),
@@ -82,6 +93,6 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
     }
 
 
-def _given(costs: CostFigures | None) -> CostFigures:
-    assert costs is not None
-    return costs
+def _given(part: Part | None) -> Part:
+    assert part is not None
+    return part

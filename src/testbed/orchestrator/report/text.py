@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from testbed.orchestrator.realtime_figures import Quantiles
+
 ABSENT = "—"
 
 
@@ -30,6 +32,12 @@ def plus_minus(value: float | None, stderr: float | None) -> str:
     if exponent == 0:
         return f"{value:.{places}f} ± {stderr:.{places}f}"
     return _times_ten(f"({value:.{places}f} ± {stderr:.{places}f})", str(exponent))
+
+
+def micros(quantiles: Quantiles) -> str:
+    """Median, 90 %, 99 % and the largest, in whole microseconds."""
+    values = (quantiles.p50, quantiles.p90, quantiles.p99, quantiles.max)
+    return " · ".join(ABSENT if value is None else count(round(value)) for value in values)
 
 
 def share(value: float | None) -> str:
