@@ -201,7 +201,11 @@ class Conductor:
                 if role is not None
             },
             "pending": [entry.number for entry in self.services.pending],
-            "events": [event.model_dump(mode="json", exclude_none=True) for event in self.happened],
+            "events": [
+                event.model_dump(mode="json", exclude_none=True)
+                for event in sorted([*self.events, *self.services.happened], key=lambda event: event.step)
+                if event.step <= at + 1 or not event.ok
+            ],
         }
 
     @property

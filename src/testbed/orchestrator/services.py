@@ -109,7 +109,8 @@ class Services:
         return len(self.pending) + len(self.happened)
 
     def proceed(self, granted: int, estimated: int) -> bool:
-        """Launch what is due, and make the changes for which everything is there; whether the clock may go on."""
+        """Launch what is due, and make the changes for which everything is there; whether any was decided."""
+        before = len(self.pending)
         self._launch_due(granted, estimated)
         for entry in list(self.pending):
             if entry.step is None and (entry.present or not self._needs_service(entry)):
@@ -122,7 +123,7 @@ class Services:
         ready = [p for p in due if p.present or not self._needs_service(p)]
         for entry in ready:
             self._make(entry)
-        return bool(ready)
+        return len(self.pending) < before
 
     def overdue(self, deadline_s: float) -> bool:
         """Refuse what was not there in time; whether there was any."""
@@ -165,7 +166,7 @@ class Services:
             self._began_s = now
         elapsed = now - self._began_s
         ahead = START_S * estimated / elapsed if elapsed > 0.1 else 0.0
-        for entry in self.pending:
+        for entry in list(self.pending):
             if entry.launched_s is not None or not self._needs_service(entry):
                 continue
             if entry.step is None or entry.step - 1 <= max(granted, estimated + ahead):

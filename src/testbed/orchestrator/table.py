@@ -25,6 +25,9 @@ def end_table(summary: Summary, directory: Path) -> RenderableType:
         parts += [_estimators(summary), *_notes(summary)]
     if summary.links:
         parts.append(_links(summary))
+    for event in summary.events:
+        if event.action != "set":
+            parts.append(_line(f"step {event.step}", event.text, "dim" if event.ok else "bold yellow"))
     parts += [_line("not ok", f"{check.name}: {check.text}", "bold yellow") for check in summary.checks if not check.ok]
     for role, reasons in summary.rejected.items():
         counts = ", ".join(f"{count} × {reason}" for reason, count in reasons.items())
