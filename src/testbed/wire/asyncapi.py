@@ -45,7 +45,11 @@ def asyncapi() -> dict[str, Any]:
                 f"Transport: Eclipse Zenoh; a role is a client of the orchestrator's session. "
                 f"A query on {keys.scenario} is answered with JSON: the run's identity and its resolved scenario "
                 f"(TOML). A role declares its subscriptions, then the liveliness token {keys.presence('{role}')}; "
-                "the run starts when all are there. Each key has one sender; seq counts its messages from 0. What a "
+                "the run starts when all are there. Each key has one sender, and that of an estimate may change from "
+                "one step to the next, with the numbers going on; "
+                "seq counts its messages from 0. What joins at step k passes over the packets before, and counts them. "
+                f"A query on {keys.handover('{role}')} orders an estimator's service to give or take a snapshot, to "
+                "serve another name, or to leave. What a "
                 f"role publishes on {keys.warm('{role}')} is read by nobody."
             ),
         },
