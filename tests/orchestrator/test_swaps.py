@@ -327,6 +327,7 @@ def test_one_that_does_not_join_in_time_is_given_up(tmp_path: Path, monkeypatch:
                 self.services.launch = lambda role: None
                 time.sleep(0.002)
                 self.tick(0.001)
+                self.ended("estimator.aoe.2", "killed by SIGKILL")
                 return
             super().fail(reason)
 

@@ -75,10 +75,8 @@ class Conductor:
         self.say: Callable[[str], None] = lambda line: None
         self._roles = list(roles)
         self._present: set[str] = set()
-        self._gone: set[str] = set()
-        """Roles that have left as they should, or were never of the run."""
-        self._left: list[str] = []
-        """Those of them whose report is of use."""
+        self._gone: list[str] = []
+        """Roles that have left as they should."""
         self._begun = False
         self._granted = 0
         self._steps, self._credit = setup.scenario.steps, setup.credit
@@ -180,7 +178,9 @@ class Conductor:
 
         Raises UsageError where that cannot be.
         """
-        if self.over or not self.started or self._granted >= self._steps:
+        if not self.started:
+            raise UsageError(f"the run has not begun; waiting for {self.awaiting()}")
+        if self.over or self._granted >= self._steps:
             raise UsageError("the run has no step left that could change")
         plan = plan_of(self.setup, self.services, event, self._granted + 1)
         number = self.services.add(plan)
@@ -236,7 +236,7 @@ class Conductor:
     @property
     def all_reported(self) -> bool:
         """Whether every role that is still there has reported."""
-        return all(role in self.reports for role in [*self._roles, *self._left] if role in self._present)
+        return all(role in self.reports for role in [*self._roles, *self._gone] if role in self._present)
 
     def _subscribe(self) -> None:
         node, keys, scenario = self.node, self.node.keys, self.setup.scenario
@@ -275,16 +275,14 @@ class Conductor:
 
     def _leaves(self, role: str) -> None:
         self._roles.remove(role)
-        self._gone.add(role)
-        self._left.append(role)
+        self._gone.append(role)
 
     def _lost(self, role: str, reason: str) -> bool:
         """Whether a role that is lost is of no consequence but for the change that it was to make."""
-        if role in self._gone:
+        if role in self._gone or role in self.services.unwanted:
             return True
         if not self.services.lost(role, reason):
             return False
-        self._gone.add(role)
         self.activity += 1
         self._advance()
         return True

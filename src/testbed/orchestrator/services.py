@@ -27,7 +27,7 @@ from testbed.wire.handover import Order, ask
 from testbed.wire.keys import Keys
 from testbed.wire.setup import Setup
 
-START_S = 2.0
+START_S = 3.0
 """A process is started so long before its step, at the speed of the run until then."""
 
 
@@ -83,6 +83,8 @@ class Services:
         self.joins: Callable[[str, str, int], None] = lambda role, name, first: None
         self.leaves: Callable[[str], None] = lambda role: None
         self.failed: Callable[[str], None] = lambda reason: None
+        self.unwanted: set[str] = set()
+        """Roles that were started and are not needed any more; how they end is of no interest."""
         self._count = Counter({role_of(spec.name): 1 for spec in scenario.estimators})
         self._began_s: float | None = None
 
@@ -274,6 +276,7 @@ class Services:
         self.happened.append(happened)
         self._say(f"step {step}: {happened.text}")
         if entry.role is not None:
+            self.unwanted.add(entry.role.name)
             self.drop(entry.role.name)
 
 
