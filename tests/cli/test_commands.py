@@ -43,7 +43,7 @@ def test_a_run_leaves_its_files_and_prints_tables(testbed: Command, tmp_path: Pa
     assert shown.err == ""
     assert "small: 12 steps, 3 lanes, seed 5" in shown.out
     files = {path.name for path in (tmp_path / "out").iterdir()}
-    assert files == {"scenario.toml", "summary.json", "recording.mcap", "report.html"}
+    assert files == {"scenario.toml", "summary.json", "lanes.npz", "recording.mcap", "report.html"}
     assert load_scenario(tmp_path / "out" / "scenario.toml") == load_scenario(tmp_path / "s.toml")
 
 

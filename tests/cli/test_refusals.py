@@ -38,6 +38,10 @@ def refused(testbed: Command, *arguments: object, code: int = 2) -> str:
         (["run", "s.toml", "again.toml"], "Got unexpected extra argument"),
         (["run", "s.toml", "--out"], "Option '--out' requires an argument"),
         (["run", "s.toml", "--in-process", "--external", "plant"], "--external needs processes"),
+        (
+            ["run", "s.toml", "--links", "relais"],
+            "--links relais: no such backend; allowed: model, relay, kernel; did you",
+        ),
         (["run", "s.toml", "--external", "plan"], "--external plan: no such role; allowed: controller, plant"),
         (["run", "absent.toml"], "absent.toml: no such file"),
         (["run", "."], ".: "),

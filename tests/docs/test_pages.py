@@ -12,7 +12,7 @@ from types import ModuleType
 import pytest
 
 from docs.blocks import PAGES, ROOT
-from testbed.orchestrator.preflight import check_estimators
+from testbed.orchestrator.preflight import check_parts
 from testbed.scenario import load_scenario
 
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
@@ -56,7 +56,7 @@ def test_generated_pages_are_up_to_date(capsys: pytest.CaptureFixture[str]) -> N
 @pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.stem)
 def test_scenarios_can_run(path: Path) -> None:
     scenario = load_scenario(path)
-    check_estimators(scenario)
+    check_parts(scenario)
     assert scenario.name == path.stem
 
 

@@ -11,7 +11,7 @@ import pytest
 from orchestrator.runs import BERNOULLI, MARKOV, figures, recorded, run, scenario, tables
 from testbed.errors import UsageError
 from testbed.estimator.registry import model_of
-from testbed.orchestrator.preflight import check_estimators
+from testbed.orchestrator.preflight import check_parts
 from testbed.orchestrator.summary import Summary
 from testbed.scenario import parse_scenario
 
@@ -133,7 +133,7 @@ def test_where_nothing_is_lost_the_run_is_that_of_zero(tmp_path: Path) -> None:
 def test_what_cannot_run_is_refused_before_the_run() -> None:
     def refused(**spec: Any) -> str:
         with pytest.raises(UsageError) as error:
-            check_estimators(parse_scenario(tables(**held(estimators=[spec]))))
+            check_parts(parse_scenario(tables(**held(estimators=[spec]))))
         return str(error.value)
 
     assert refused(name="kfio", acks="none").startswith("estimators.kfio: kfio needs every ACK and gets none")

@@ -1,6 +1,7 @@
 import base64
 import csv
 import io
+import math
 import re
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
@@ -101,7 +102,35 @@ def without_data():
     )
 
 
+def costs(step, stderr, **overrides):
+    """The cost of a run; two thirds are the state's."""
+    total = math.inf if np.max(step, initial=0.0) > 1e300 else float(np.sum(step))
+    series = {"step_mean": step, "state_mean": step * (2 / 3), "input_mean": step / 3}
+    series |= {name.replace("mean", "stderr"): stderr for name in list(series)}
+    own = {"total": total, "total_stderr": None, "a_step": total / len(step)} if len(step) else {}
+    return {"cost": {**series, **own, **overrides}, "controller": CONTROLLER}
+
+
+CONTROLLER = {
+    "kind": "lqg",
+    "estimator": "aoe",
+    "gain": [[1.25, -0.5]],
+    "statement": "optimal: <b>so</b>",
+    "counters": {"saturated": 1234},
+}
 CASES = {
+    "cost": lambda: fabricate(
+        steps=40, **costs(FLAT, FLAT / 9, total_stderr=9.0, a_step_stderr=0.225, total_interval_95=[1182.4, 1217.6])
+    ),
+    "cost of one lane": lambda: fabricate(steps=40, lanes=1, **costs(FLAT, np.full(40, np.nan))),
+    "cost of one step": lambda: fabricate(steps=1, **costs(FLAT[:1], FLAT[:1])),
+    "cost that grows": lambda: fabricate(steps=40, **costs(10.0**K, 9.0 * 10.0**K)),
+    "cost beyond numbers": lambda: fabricate(steps=40, **costs(1e308 * np.where(K < 20, 0.01, 1), np.full(40, 1e308))),
+    "cost of nothing": lambda: fabricate(steps=40, **costs(0 * FLAT, 0 * FLAT)),
+    "cost without figures": lambda: fabricate(steps=40, **costs(np.nan * FLAT, np.nan * FLAT)),
+    "cost of no step": lambda: fabricate(
+        steps=5, completed_steps=0, status="failed", bounds=None, estimators={}, **costs(FLAT[:0], FLAT[:0])
+    ),
     "ordinary": lambda: fabricate(steps=40),
     "one lane": lambda: fabricate(steps=40, lanes=1),
     "one step": lambda: fabricate(steps=1),
@@ -220,6 +249,20 @@ def test_settings_of_matplotlib_neither_matter_nor_change(page):
     with matplotlib.rc_context({"axes.grid": False, "font.size": 30, "lines.linewidth": 9}):
         assert page(fabricate(steps=10)).html == plain
         assert matplotlib.rcParams["font.size"] == 30
+
+
+def test_the_cost_stands_in_the_page_with_its_interval(page):
+    made = page(CASES["cost"]())
+    assert "Controller: lqg , on the estimate of aoe." in made.text
+    assert "[[1.250, -0.5000]]" in made.text
+    assert "For its cost it is optimal: <b>so</b>." in made.text
+    assert "Saturated: 1 234 of 10 240 lane-steps." in made.text
+    assert "30.00 ± 0.23 a step, 1200.0 ± 9.0 in all (95 %: 1182 to 1218)" in made.text
+    rows = list(csv.DictReader(io.StringIO(made.download("cost.csv"))))
+    assert [float(row["step_mean"]) for row in rows] == [30.0] * 40
+    assert [float(row["input_stderr"]) for row in rows] == list(FLAT / 9)
+    assert "cost-figure" in made.ids
+    assert "cost-figure" not in page(fabricate(steps=40)).ids
 
 
 def test_captions_say_what_holds(page):

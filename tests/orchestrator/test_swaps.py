@@ -78,13 +78,13 @@ def published(folder: Path) -> Counter[tuple[str, int, int]]:
 
 def able(**changes: Any) -> list[dict[str, Any]]:
     """Every built-in kind that can run in that scenario."""
-    from testbed.orchestrator.preflight import check_estimators
+    from testbed.orchestrator.preflight import check_parts
 
     out = []
     for kind in kinds():
         spec = {"name": kind, "acks": "none", **KINDS.get(kind, {})}
         try:
-            check_estimators(scenario(**{**changes, "estimators": [spec]}))
+            check_parts(scenario(**{**changes, "estimators": [spec]}))
         except UsageError:
             continue
         out.append(spec)

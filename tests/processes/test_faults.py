@@ -55,7 +55,7 @@ def running(tmp_path: Path, *, head: str = "", at_least: int = 400) -> Running:
     ("module", "role"),
     [
         ("testbed.plant --", "plant"),
-        ("testbed.plant.controller", "controller"),
+        ("testbed.control", "controller"),
         ("testbed.channel --link control", "link.control"),
         ("testbed.channel --link observation", "link.observation"),
         ("testbed.estimator --name aoe", "estimator.aoe"),

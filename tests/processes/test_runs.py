@@ -44,7 +44,7 @@ def test_every_role_is_a_process_of_its_own(tmp_path: Path) -> None:
     process.terminate()
     finish(process)
     links = ("--link control", "--link observation")
-    parts = ("plant.controller", "plant --", *links, "bounds", "--name aoe", "--name kfio")
+    parts = ("testbed.control", "plant --", *links, "bounds", "--name aoe", "--name kfio")
     for part in parts:
         assert sum(part in command for command in commands.values()) == 1, part
 

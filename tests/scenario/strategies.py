@@ -62,10 +62,16 @@ def inputs(draw: st.DrawFn, n: int, q: int, steps: int, estimators: list[str]) -
     def channels(entries: st.SearchStrategy[float]) -> st.SearchStrategy[Any]:
         return entries | st.lists(entries, min_size=q, max_size=q)
 
-    kinds = ["constant", "exponential", "sine", "uniform", "table"] + ["feedback"] * bool(estimators)
+    closed = ["feedback", "lqg", "pid", "python"] if estimators else []
+    kinds = ["constant", "exponential", "sine", "uniform", "table", *closed]
     kind = draw(st.sampled_from(kinds))
     vector = st.lists(numbers, min_size=q, max_size=q)
     optional = {"offset": channels(numbers), "amplitude": channels(numbers)}
+    following = {
+        "estimator": st.sampled_from(estimators or [""]),
+        "low": channels(st.floats(-9, 0)),
+        "high": channels(st.floats(0, 9)),
+    }
     tables: dict[str, st.SearchStrategy[dict[str, Any]]] = {
         "constant": st.fixed_dictionaries({"value": vector}),
         "exponential": st.fixed_dictionaries({"tau": channels(positive)}, optional=optional),
@@ -75,7 +81,32 @@ def inputs(draw: st.DrawFn, n: int, q: int, steps: int, estimators: list[str]) -
         "uniform": st.fixed_dictionaries({"low": channels(st.floats(-9, 0)), "high": channels(st.floats(0, 9))}),
         "table": st.fixed_dictionaries({"values": matrix(steps, q)}),
         "feedback": st.fixed_dictionaries(
-            {"gain": matrix(q, n)}, optional={"estimator": st.sampled_from(estimators or [""])}
+            {"gain": matrix(q, n)},
+            optional={
+                **following,
+                "reference": st.lists(numbers, min_size=n, max_size=n),
+                "feedforward": channels(numbers),
+            },
+        ),
+        "lqg": st.one_of(
+            st.fixed_dictionaries({"Qx": covariance(n), "Ru": covariance(q, diagonal=1.0)}, optional=following),
+            st.fixed_dictionaries(
+                {"Qx": covariance(n), "Ru": covariance(q, diagonal=1.0), "horizon": st.just("run")},
+                optional={**following, "terminal": covariance(n)},
+            ),
+        ),
+        "pid": st.fixed_dictionaries(
+            {"output": matrix(q, n)},
+            optional={
+                **following,
+                **{key: channels(numbers) for key in ("setpoint", "kp", "ki", "kd", "feedforward")},
+                "filter": channels(st.floats(0, 9)),
+                "tracking": channels(st.floats(1, 9)),
+            },
+        ),
+        "python": st.fixed_dictionaries(
+            {"controller": st.sampled_from(["own:Controller", "registered"])},
+            optional={**following, "options": st.fixed_dictionaries({}, optional={"a": numbers, "b": st.text()})},
         ),
     }
     return {"kind": kind, **draw(tables[kind])}
@@ -181,6 +212,14 @@ def scenarios(draw: st.DrawFn) -> dict[str, Any]:
         "bounds": st.booleans(),
         "clock": clocks,
         "actuator": st.fixed_dictionaries({}, optional={"on_loss": st.sampled_from(policies)}),
+        "cost": st.fixed_dictionaries(
+            {"Qx": covariance(n)},
+            optional={
+                **({"Ru": covariance(q)} if q else {}),
+                "terminal": covariance(n),
+                "reference": st.lists(numbers, min_size=n, max_size=n),
+            },
+        ),
         "links": st.fixed_dictionaries({}, optional={"control": links, "observation": observation_links, "ack": acks}),
         "transport": transports,
     }

@@ -31,6 +31,7 @@ def test_the_kind_chooses_the_part_and_the_carrier() -> None:
         ({"kind": "udp", "mss": 1000}, "Extra inputs"),
         ({"kind": "tcp", "congestion": "bbr"}, "'cubic' or 'reno'"),
         ({"kind": "tcp", "mss": 2000, "buffer_bytes": 1999}, "got 1999; allowed: at least mss, which is 2000"),
+        ({"kind": "tcp", "keep_alive": "1 s"}, "got '1 s' without delayed_ack; allowed: only with it"),
         ({"kind": "tcp", "lease": "0 s"}, "allowed"),
         ({"kind": "sctp"}, "'udp', 'tcp'"),
     ],

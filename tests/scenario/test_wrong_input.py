@@ -326,7 +326,7 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"input": {"kind": "exp"}},
-        "input.kind: got 'exp'; allowed: constant, exponential, sine, uniform, table, feedback; "
+        "input.kind: got 'exp'; allowed: constant, exponential, sine, uniform, table, feedback, lqg, pid, python; "
         "did you mean 'exponential'?",
     ),
     (
@@ -385,6 +385,80 @@ EXACT: list[tuple[dict[str, Any], str]] = [
         {"input": {"kind": "feedback", "gain": [[1, 1]]}, "estimators": [{"name": "oe", "until": 24}]},
         "input.estimator: got 'oe', which ends at step 24; allowed: one that runs to step 100",
     ),
+    # the controllers
+    (
+        {"input": {"kind": "feedback", "gain": [[1, 1]], "reference": [1]}},
+        "input.reference: got 1 number; allowed: 2, the size of A",
+    ),
+    (
+        {"input": {"kind": "feedback", "gain": [[1, 1]], "low": [0, 0]}},
+        "input.low: got 2 numbers; allowed: 1, the number of columns of system.B",
+    ),
+    (
+        {"input": {"kind": "feedback", "gain": [[1, 1]], "low": 1, "high": [0.5]}},
+        "input.high: got [0.5]; allowed: not less than low, which is 1.0",
+    ),
+    (
+        {"input": {"kind": "lqg", "Qx": [[1]], "Ru": [[1]]}},
+        "input.Qx: got 1 × 1; allowed: 2 × 2, from the size of A",
+    ),
+    (
+        {"input": {"kind": "lqg", "Qx": [[1, 2], [2, 1]], "Ru": [[1]]}},
+        "input.Qx: Qx is not positive semi-definite: its smallest eigenvalue is -1",
+    ),
+    (
+        {"input": {"kind": "lqg", "Qx": [[1, 0], [0, 1]], "Ru": [[0]]}},
+        "input.Ru: Ru is not positive definite: its smallest eigenvalue is 0",
+    ),
+    (
+        {"input": {"kind": "lqg", "Qx": [[1, 0], [0, 1]], "Ru": [[1]], "terminal": [[1, 0], [0, 1]]}},
+        "input.terminal: got a weight of the last state with horizon 'stationary'; allowed: only with horizon 'run'",
+    ),
+    (
+        {"input": {"kind": "lqg", "Qx": [[1, 0], [0, 1]], "Ru": [[1]], "horizon": "ran"}},
+        "input.horizon: got 'ran'; allowed: stationary, run; did you mean 'run'?",
+    ),
+    (
+        {"input": {"kind": "lqg", "Qx": [[1, 0], [0, 1]], "Ru": [[1]]}, "estimators": []},
+        "input.estimator: got no [[estimators]]; allowed: lqg only through an estimator of the scenario",
+    ),
+    (
+        {"input": {"kind": "pid", "kp": 1, "output": [[1]]}},
+        "input.output: got 1 × 1; allowed: 1 × 2, an output for each input channel",
+    ),
+    (
+        {"input": {"kind": "pid", "kp": 1, "filter": -1, "output": [[1, 0]]}},
+        "input.filter: got -1.0; allowed: 0 or more",
+    ),
+    (
+        {"input": {"kind": "pid", "kp": 1, "tracking": 0.5, "output": [[1, 0]]}},
+        "input.tracking: got 0.5; allowed: 1 or more",
+    ),
+    (
+        {"input": {"kind": "pid", "Kp": 1}},
+        "input: unknown key 'Kp'; did you mean 'kp'?",
+    ),
+    (
+        {"input": {"kind": "python", "controller": "a:B", "options": {"x": NAN}}},
+        "input.options.x: got nan; allowed: true or false, a finite number, a text, a list or a table",
+    ),
+    # the cost
+    (
+        {"cost": {"Ru": [[1]]}},
+        "cost.Qx: missing; needed: Weight of the state, n x n, symmetric, positive semi-definite",
+    ),
+    (
+        {"cost": {"Qx": [[1, 0], [1, 1]]}},
+        "cost.Qx: Qx is not symmetric: got 0.0 at [0][1] and 1.0 at [1][0]",
+    ),
+    (
+        {"cost": {"Qx": [[1, 0], [0, 1]], "reference": [1, 2, 3]}},
+        "cost.reference: got 3 numbers; allowed: 2, the size of A",
+    ),
+    (
+        {"system.B": ABSENT, "cost": {"Qx": [[1, 0], [0, 1]], "Ru": [[1]]}},
+        "cost.Ru: got a weight of the input, but system.B is not given; allowed: nothing",
+    ),
     # the estimators
     ({"estimators": {"name": "oe"}}, "estimators: got a table; allowed: an array of tables, [[estimators]]"),
     ({"estimators": ["oe"]}, "estimators[0]: got 'oe'; allowed: an array of tables, [[estimators]]"),
@@ -414,7 +488,8 @@ EXACT: list[tuple[dict[str, Any], str]] = [
     ),
     (
         {"estimators": [{"name": "oe", "options": {"kind": 3}}]},
-        "estimators[0].options: got the reserved key 'kind'; allowed: any key but name, kind, acks, until, options",
+        "estimators[0].options: got the reserved key 'kind'; allowed: any key but name, kind, acks, until, buffer, "
+        "options",
     ),
     # the rest
     ({"seed": 2**63}, f"seed: got {2**63}; allowed: an integer, 0 … {2**63 - 1}"),
@@ -460,7 +535,7 @@ def test_wrong_value(changes: dict[str, Any], expected: str) -> None:
 def test_an_unknown_key_like_no_other_lists_what_is_allowed() -> None:
     assert message(changed({"zzz": 1})) == (
         "unknown key 'zzz'; allowed: name, steps, lanes, seed, record, bounds, clock, system, uncertainty, "
-        "estimators, actuator, input, links, transport"
+        "estimators, actuator, input, cost, links, transport, events"
     )
 
 

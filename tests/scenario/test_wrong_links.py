@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 
 from scenario.test_wrong_input import changed, message
+from testbed.errors import UsageError
+from testbed.scenario import parse_scenario
 
 OBS, ACK, CON = "links.observation", "links.ack", "links.control"
 WRONG: list[tuple[dict[str, Any], str, str]] = [
@@ -61,3 +63,24 @@ def test_wrong_links(changes: dict[str, Any], where: str, given: str) -> None:
     text = message(changed(changes))
     assert text.startswith(f"{where}: "), text
     assert given in text
+
+
+def test_a_slot_is_not_too_short_for_the_period() -> None:
+    system = {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]], "Q": [[1.0]], "R": [[1.0]]}
+    tables: dict[str, Any] = {"system": system, "links": {"control": {"clock": "time", "slot": "9999 ns"}}}
+    with pytest.raises(UsageError) as refusal:
+        parse_scenario(tables)
+    assert str(refusal.value) == (
+        "scenario: links.control.slot: got '9999 ns'; allowed: '10 us' or more, with the period '10 ms'"
+    )
+    tables["links"]["control"]["slot"] = "10 us"
+    assert parse_scenario(tables).links.control.slot == "10 us"
+
+
+def test_a_trace_that_ends_before_the_last_slot_is_refused() -> None:
+    system = {"A": [[1.0]], "C": [[1.0]], "Q": [[1.0]], "R": [[1.0]]}
+    loss = {"kind": "trace", "fates": "1" * 20, "repeat": False}
+    link = {"loss": loss, "clock": "time", "slot": "5 ms"}  # 2 slots a period
+    parse_scenario({"steps": 10, "system": system, "links": {"observation": link}})
+    with pytest.raises(UsageError, match=r"links\.observation\.loss"):
+        parse_scenario({"steps": 11, "system": system, "links": {"observation": link}})

@@ -82,6 +82,7 @@ def plain(draw: st.DrawFn, kind: str) -> tuple[Message, Arrays]:
     own: dict[str, Any] = {
         "clock": {"step": draw(counts)},
         "command": {"action": "stop"},
+        "change": {"step": draw(counts), "set": draw(st.dictionaries(st.text(max_size=5), finite, max_size=3))},
         "status": {
             "state": draw(st.sampled_from(["failed", "stopped"])),
             "detail": draw(st.text(st.characters(exclude_categories=["Cs"]), max_size=50)),

@@ -51,10 +51,13 @@ def assert_fits(header: Any, arrays: dict[str, Any], kind: str) -> None:
     assert 0 <= header.lane < header.lane + header.lanes <= SIZES.lanes
     assert (0 if kind == "control" else 1) <= header.step <= SIZES.steps
     assert {name for name, rule in header.ARRAYS.items() if rule.required} <= set(arrays) <= set(header.ARRAYS)
+    late = arrays["late_step"].shape[1] if "late_step" in arrays else 0
     for name, array in arrays.items():
         rule = header.ARRAYS[name]
-        assert array.shape == shape_of(rule, header.lanes)
+        assert array.shape == shape_of(rule, header.lanes, late=late)
         assert np.isfinite(array).all() if rule.dtype == "<f8" else np.isin(array, (0, 1)).all()
+    if late:
+        assert 1 <= arrays["late_step"].min() <= arrays["late_step"].max() < header.step
 
 
 @fuzz

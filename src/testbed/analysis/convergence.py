@@ -15,9 +15,9 @@ from testbed.analysis.structure import Reach
 from testbed.channel.law import LossModel
 from testbed.numerics.lanes import Floats
 from testbed.scenario import (
+    ClosedLoop,
     ConstantInput,
     ExponentialInput,
-    FeedbackInput,
     Input,
     SineInput,
     UniformInput,
@@ -144,7 +144,7 @@ def fading_of(source: Input | None) -> Fading:
     if isinstance(source, UniformInput):
         silent = _zero(source.low) and _zero(source.high)
         return _zero_or_not(silent, "u is drawn afresh at each step: it does not tend to 0")
-    kind = "fed back" if isinstance(source, FeedbackInput) else "a table of finite length"
+    kind = "fed back" if isinstance(source, ClosedLoop) else "a table of finite length"
     return Fading(None, 1.0, f"u is {kind}: its limit is not known")
 
 

@@ -21,8 +21,9 @@ from testbed.channel.in_time import law_of_link
 from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain
 from testbed.estimator.bounds import held_factor
+from testbed.estimator.buffers import largest_buffer
 from testbed.numerics.lanes import Floats
-from testbed.scenario import FeedbackInput, Input, Links, Loss, Scenario
+from testbed.scenario import ClosedLoop, Input, Links, Loss, Scenario
 
 _AT_THRESHOLD = 1e-9
 """Relative distance below which a rate counts as equal to its threshold; no theorem decides there."""
@@ -109,7 +110,7 @@ def analyze(scenario: Scenario) -> dict[str, Any]:
 def _figures(scenario: Scenario, facts: Facts) -> dict[str, Any]:
     A = facts.A
     observed, controlled = scenario.links.observation.loss, scenario.links.control.loss
-    chain = _simplest(law_of_link(scenario, "observation"))
+    chain = _simplest(law_of_link(scenario, "observation", largest_buffer(scenario)))
     in_time = law_of_link(scenario, "control")
     control = _simplest(in_time)
     verdict = observation_verdict(facts, chain)
@@ -255,7 +256,7 @@ def control_verdict(observation: Verdict, chain: LossModel, source: Input | None
             return Verdict(
                 False if observation.stable is False else None, theorem, "the states alternate: S is not bounded"
             )
-    if isinstance(source, FeedbackInput):
+    if isinstance(source, ClosedLoop):
         return Verdict(
             False if observation.stable is False else None, theorem, "u is fed back, so that its bound is not known"
         )
@@ -278,7 +279,7 @@ def held_control_verdict(observation: Verdict, chain: LossModel, source: Input |
 def held_bound_verdict(observation: Verdict, chain: LossModel, source: Input | None) -> Verdict:
     """S with an actuator that holds (see estimator.bounds): for i.i.d. control losses."""
     theorem, factor = "S, held inputs", held_factor(chain)
-    if isinstance(source, FeedbackInput):
+    if isinstance(source, ClosedLoop):
         return Verdict(None, theorem, "u is fed back: no bound of what is held is known")
     if factor is None:
         return Verdict(None, theorem, "the actuator holds, and a bound is known for i.i.d. control losses only")
@@ -287,7 +288,7 @@ def held_bound_verdict(observation: Verdict, chain: LossModel, source: Input | N
 
 def upper_bound_verdict(observation: Verdict, source: Input | None) -> Verdict:
     """The bound S of M Theorem 3: the recursion with every ACK, with ¼ U added to Q."""
-    if isinstance(source, FeedbackInput):
+    if isinstance(source, ClosedLoop):
         return Verdict(None, "M Theorem 3", "u is fed back: no U ≥ B u u' B' is known")
     return Verdict(observation.stable, "M Theorem 3", "the recursion with every ACK, and ¼ U more noise")
 

@@ -14,8 +14,7 @@ from testbed.channel.hidden import Hidden, HiddenChain
 from testbed.channel.law import LossModel
 from testbed.channel.loss import Chain, LossCounts
 from testbed.channel.packets import packet_bytes
-from testbed.channel.steps import SteppedLink
-from testbed.numerics.lanes import Floats
+from testbed.numerics.lanes import Bools, Floats
 from testbed.scenario import Scenario, ScriptedLoss, TraceLoss
 from testbed.scenario.durations import parse_duration
 from testbed.scenario.impairments import ConstantDelay
@@ -25,13 +24,16 @@ SAMPLED = 20_000
 _SEED = 20_000
 
 
-def law_of_link(scenario: Scenario, link: str) -> LossModel:
-    """The losses of a link of a scenario as they are seen from step to step."""
-    return law_in_steps(getattr(scenario.links, link), scenario.clock.period_ns, packet_bytes(scenario, link))
+def law_of_link(scenario: Scenario, link: str, late: int = 0) -> LossModel:
+    """The losses of a link of a scenario as they are seen from step to step, or from ``late`` steps later."""
+    settings = getattr(scenario.links, link)
+    return law_in_steps(settings, scenario.clock.period_ns, packet_bytes(scenario, link), late)
 
 
-def law_in_steps(link: SteppedImpairments, period_ns: int, size: int) -> LossModel:
+def law_in_steps(link: SteppedImpairments, period_ns: int, size: int, late: int = 0) -> LossModel:
     """The losses of a link as they are seen from step to step, a packet of ``size`` bytes a period.
+
+    late: a packet counts as lost only if it is later than its deadline by more than so many periods.
 
     ``assumed`` where it is given. Otherwise exact, but for a clock whose slots do not divide the period (there, the
     mean over their phases), where packets do not depend on each other but through the chain; with a bottleneck,
@@ -43,9 +45,8 @@ def law_in_steps(link: SteppedImpairments, period_ns: int, size: int) -> LossMod
         link = link.model_copy(update={"loss": link.loss.law})
     if not link.takes_time:
         return chain_of(link.loss)
-    if has_formula(link):
-        return _exact(link, period_ns)
-    return _sampled(link, period_ns, size)
+    until_ns = link.deadline_ns(period_ns) + late * period_ns
+    return _exact(link, period_ns, until_ns) if has_formula(link) else _sampled(link, period_ns, until_ns, size)
 
 
 def has_formula(link: SteppedImpairments) -> bool:
@@ -55,9 +56,9 @@ def has_formula(link: SteppedImpairments) -> bool:
     return link.delay is None or isinstance(link.delay, ConstantDelay) or not link.delay.in_order
 
 
-def _exact(link: SteppedImpairments, period_ns: int) -> LossModel:
+def _exact(link: SteppedImpairments, period_ns: int, until_ns: int) -> LossModel:
     losses = chain_of(link.loss)
-    arrives = _arrives_in_time(link, link.deadline_ns(period_ns))
+    arrives = _arrives_in_time(link, until_ns)
     if link.slot is None and arrives == 1.0:
         return losses
     initial, moves, loss = _hidden_form(losses)
@@ -107,14 +108,24 @@ def _arrives_in_time(link: SteppedImpairments, deadline_ns: int) -> float:
 
 
 @lru_cache(maxsize=16)
-def _sampled(link: SteppedImpairments, period_ns: int, size: int) -> Chain:
-    carriers = carriers_of(link, _SEED, "law", 0, 1)
-    stepped, counts = SteppedLink(carriers, size, period_ns, link.deadline_ns(period_ns)), LossCounts()
+def _sampled(link: SteppedImpairments, period_ns: int, until_ns: int, size: int) -> Chain:
+    (carrier,), counts = carriers_of(link, _SEED, "law", 0, 1), LossCounts()
+    arrived = np.zeros(SAMPLED, dtype=np.bool_)
     for number in range(SAMPLED):
-        counts.count(0, bool(stepped.send(number).in_time[0]))
+        carrier.send(number, size, number * period_ns)
+        _note(arrived, carrier.advance((number + 1) * period_ns - 1), period_ns, until_ns)
+    _note(arrived, carrier.advance((SAMPLED - 1) * period_ns + until_ns), period_ns, until_ns)
+    for fate in arrived.tolist():
+        counts.count(0, fate)
     (bad, recovered), (failed, good) = counts.transitions
     if not counts.dropped:
         return Chain.lossless()
     if not counts.delivered:
         return Chain.bernoulli(0.0)
     return Chain.markov(recovered / max(1, bad + recovered), failed / max(1, failed + good))
+
+
+def _note(arrived: Bools, arrivals: list[tuple[int, int]], period_ns: int, until_ns: int) -> None:
+    """Which packets have arrived in so much time after they were sent."""
+    for at_ns, number in arrivals:
+        arrived[number] |= at_ns - number * period_ns <= until_ns

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from functools import partial
 from typing import Any
 
@@ -13,16 +12,20 @@ from testbed.channel.carriers import carriers_of
 from testbed.channel.loss import LossCounts
 from testbed.channel.packets import packet_bytes
 from testbed.channel.processes import FateProcess, goes_on, process_of
+from testbed.channel.real.pace import Pace
+from testbed.channel.real.service import RealLinkService
+from testbed.channel.real.timer import Timer
 from testbed.channel.steps import SteppedLink
-from testbed.channel.timed import TimedBlock, room
+from testbed.channel.timed import TimedBlock, room, timed_counters
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
 from testbed.scenario import AckLink, Link, Loss, NoLoss, Scenario
+from testbed.scenario.backend import real_links
 from testbed.scenario.changes import changed
 from testbed.scenario.links import SteppedImpairments
 from testbed.wire.keys import LinkName
 from testbed.wire.messages import Acknowledgement, Change, Control, Observation, Packet
-from testbed.wire.node import ORCHESTRATOR, Node
+from testbed.wire.node import ORCHESTRATOR, Node, PacketHandler
 from testbed.wire.setup import Setup
 
 _TYPES: dict[LinkName, tuple[type[Packet], str, str]] = {
@@ -41,7 +44,14 @@ def role_of(link: LinkName) -> str:
 
 def builder(link: LinkName) -> Any:
     """What builds the service of one link."""
-    return partial(LinkService, link=link)
+
+    def build(node: Node, setup: Setup) -> LinkService | RealLinkService:
+        if getattr(setup.scenario.links, link).is_real:
+            model, sender, name = _TYPES[link]
+            return RealLinkService(node, setup, link=link, model=model, sender=sender, name=name)
+        return LinkService(node, setup, link=link)
+
+    return build
 
 
 def loss_of(scenario: Scenario, link: LinkName) -> Loss:
@@ -63,13 +73,6 @@ def _process(scenario: Scenario, link: LinkName, loss: Loss, lane: int, lanes: i
     return process_of(loss, stream, lanes)
 
 
-def is_timed(scenario: Scenario, link: LinkName) -> bool:
-    """Whether a link takes time, at the beginning or after an event, or carries ACKs in batches."""
-    settings = getattr(scenario.links, link)
-    batched = isinstance(settings, AckLink) and settings.batch > 1
-    return batched or any(variant.takes_time for variant in scenario.variants(link))
-
-
 def timed_block(scenario: Scenario, link: LinkName, lane: int, lanes: int, size: int) -> TimedBlock:
     """A block of lanes of a link that takes time; size: bytes of a packet of one lane."""
     settings: SteppedImpairments = getattr(scenario.links, link)
@@ -80,22 +83,6 @@ def timed_block(scenario: Scenario, link: LinkName, lane: int, lanes: int, size:
     batch = settings.batch if isinstance(settings, AckLink) else 1
     keep = room(scenario.lanes, 8 * max(scenario.system.p, scenario.system.q), batch)
     return TimedBlock(stepped, lanes, name, first_step=model.FIRST_STEP, keep=keep, batch=batch)
-
-
-def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]:
-    """The counters of a link that takes time; nothing where there is no block."""
-    total: Counter[str] = Counter()
-    for block in blocks:
-        books = block.books
-        total["late"] += block.late
-        if not keeps_late:
-            books.delivered -= block.late
-            books.dropped["late"] += block.late
-        counts = block.counts.as_counters()
-        total.update({key: counts[key] for key in ("bursts", "00", "01", "10", "11")})
-        total.update(books.as_counters())
-        total.update({f"transport_{key}": count for key, count in block.transport.items()})
-    return dict(total)
 
 
 class LinkService:
@@ -115,7 +102,7 @@ class LinkService:
         settings: SteppedImpairments = getattr(scenario.links, link)
         self._now = {lane: (0, settings) for lane, _ in setup.blocks}
         """By block of lanes: how many changes were made, and the link after them."""
-        timed = is_timed(scenario, link)
+        timed = scenario.takes_time(link)
         self._losses = {lane: loss_process(scenario, link, lane, lanes) for lane, lanes in setup.blocks if not timed}
         self._process_of = partial(_process, scenario, link)
         size = packet_bytes(scenario, link)
@@ -126,7 +113,9 @@ class LinkService:
         noise = link == "observation" and scenario.links.observation.on_loss == "noise"
         self._instead = "noise" if noise else None
         needs = (self._content, self._instead) if self._instead else (self._content,)
-        handler = self._pass_on_timed if timed else self._pass_on
+        handler: PacketHandler[Packet] = self._pass_on_timed if timed else self._pass_on
+        if link == "control" and real_links(scenario):
+            handler = Pace(node, node.leaving.enter_context(Timer(node.bus.call)), scenario.clock.period_ns, handler)
         node.on(node.keys.sent(link), model, sender, handler, needs=needs)
         node.on(node.keys.change(link), Change, ORCHESTRATOR, self._note)
 

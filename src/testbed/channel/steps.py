@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -27,6 +28,28 @@ class Arrivals:
 
     in_time: Bools
     late: list[tuple[int, Bools]]
+
+
+class StepLink(Protocol):
+    """A link for a block of lanes, seen in steps."""
+
+    @property
+    def books(self) -> Books:
+        """Of all lanes together."""
+        ...
+
+    @property
+    def transport(self) -> Counter[str]:
+        """What the connections under it did."""
+        ...
+
+    def send(self, number: int) -> Arrivals:
+        """Send packet ``number`` in every lane, and what has arrived by its deadline."""
+        ...
+
+    def change(self, settings: Impairments) -> None:
+        """Other impairments for the packets from now on."""
+        ...
 
 
 class SteppedLink:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from testbed.channel.books import Books
 from testbed.channel.loss import LossCounts
-from testbed.channel.steps import SteppedLink
+from testbed.channel.steps import StepLink
 from testbed.numerics.lanes import Bools
 from testbed.scenario.links import Impairments
 
@@ -27,7 +27,7 @@ class TimedBlock:
     What is kept is bounded: what comes more than ``keep`` packets late is dropped and counted as "stale".
     """
 
-    def __init__(self, link: SteppedLink, lanes: int, name: str, *, first_step: int, keep: int, batch: int = 1) -> None:
+    def __init__(self, link: StepLink, lanes: int, name: str, *, first_step: int, keep: int, batch: int = 1) -> None:
         """name: of the content. first_step: step of packet 0. keep: see above, and ``room``. batch: outcomes that a
         packet carries (ACKs), less than keep."""
         self._link, self._lanes, self._name = link, lanes, name
@@ -123,3 +123,19 @@ def _blanked(content: NDArray[Any], lanes: Bools) -> NDArray[Any]:
     out = np.array(content)
     out[~lanes] = 0
     return out
+
+
+def timed_counters(blocks: list[TimedBlock], keeps_late: bool) -> dict[str, int]:
+    """The counters of a link that takes time; nothing where there is no block."""
+    total: Counter[str] = Counter()
+    for block in blocks:
+        books = block.books
+        total["late"] += block.late
+        if not keeps_late:
+            books.delivered -= block.late
+            books.dropped["late"] += block.late
+        counts = block.counts.as_counters()
+        total.update({key: counts[key] for key in ("bursts", "00", "01", "10", "11")})
+        total.update(books.as_counters())
+        total.update({f"transport_{key}": count for key, count in block.transport.items()})
+    return dict(total)

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from testbed import __version__
-from testbed.cli import analyze, conformance, ctl, link, replay, run, schema
+from testbed.cli import analyze, compare, conformance, ctl, link, replay, run, schema
 from testbed.errors import TestbedError
 
 app = typer.Typer(
@@ -23,6 +23,7 @@ app = typer.Typer(
 )
 app.command("run")(run.run)
 app.command("analyze")(analyze.analyze)
+app.command("compare")(compare.compare)
 app.command("conformance")(conformance.conformance)
 app.command("replay")(replay.replay)
 app.command("schema")(schema.schema)

@@ -5,9 +5,12 @@ from __future__ import annotations
 import sys
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
+
+if TYPE_CHECKING:
+    from testbed.scenario.links import Backend
 
 EXIT_CODES = {"complete": 0, "failed": 1, "interrupted": 130}
 
@@ -20,6 +23,10 @@ def run(
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Everything in this process, without zenoh; the same figures.")
     ] = False,
+    links: Annotated[
+        str | None,
+        typer.Option(metavar="BACKEND", help="Every link as model, relay or kernel; default: as the scenario says."),
+    ] = None,
     external: Annotated[
         list[str] | None,
         typer.Option(metavar="ROLE", help="A role that you start by hand; the run prints how, and waits for it."),
@@ -38,10 +45,13 @@ def run(
     from testbed.orchestrator.run import Run
     from testbed.orchestrator.table import end_table
     from testbed.scenario import load_scenario
+    from testbed.scenario.backend import with_backend
 
     if in_process and external:
         raise UsageError("--external needs processes; allowed: without --in-process")
     loaded = load_scenario(scenario)
+    if links is not None:
+        loaded = with_backend(loaded, _backend(links))
     if out is None:
         out = Path("runs") / f"{_file_name(loaded.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     console = Console(stderr=True)
@@ -55,6 +65,16 @@ def run(
     if summary.status == "failed":
         console.print(f"testbed: run {summary.status}: {summary.reason}", markup=False, highlight=False, soft_wrap=True)
     raise typer.Exit(EXIT_CODES[summary.status])
+
+
+def _backend(name: str) -> Backend:
+    from testbed.errors import UsageError, did_you_mean
+    from testbed.scenario.links import Backend
+
+    names = get_args(Backend)
+    if name not in names:
+        raise UsageError(f"--links {name}: no such backend; allowed: {', '.join(names)}{did_you_mean(name, names)}")
+    return cast("Backend", name)
 
 
 def _file_name(name: str) -> str:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from testbed.channel.service import is_timed
 from testbed.errors import RunFailed
 from testbed.estimator.bounds import Bounds, LateBound, upper_bound
 from testbed.estimator.registry import model_of
@@ -41,7 +40,7 @@ class BoundsService:
         self._late = {
             lane: LateBound(model, lanes, _DEPTH)
             for lane, lanes in setup.blocks
-            if is_timed(setup.scenario, "observation")
+            if setup.scenario.takes_time("observation")
         }
         self._send = node.sender(node.keys.bounds, BoundsMessage, lazy=True)
         node.on(node.keys.delivered("observation"), Observation, "link.observation", self._take, needs=("mask",))

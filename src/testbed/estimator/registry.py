@@ -6,15 +6,14 @@ A package registers its own under the entry-point group ``testbed.estimators``; 
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.metadata import entry_points
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
+from testbed import plugins
 from testbed.channel.in_time import law_of_link
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.model import Estimator, Model
@@ -133,29 +132,5 @@ def factory_of(kind: str) -> Callable[..., Estimator]:
 
 
 def checked_options(kind: str, factory: Callable[..., Estimator], options: dict[str, Any]) -> dict[str, Any]:
-    """Options as the factory's signature wants them: parameters after (model, lanes), by name and type.
-
-    Raises UsageError for one that is unknown, missing or of another type.
-    """
-    parameters = list(inspect.signature(factory).parameters.values())[2:]
-    hints = get_type_hints(factory.__init__ if inspect.isclass(factory) else factory, include_extras=True)
-    allowed = [parameter.name for parameter in parameters]
-    for name in options:
-        if name not in allowed:
-            listed = ", ".join(allowed) if allowed else "none"
-            raise UsageError(
-                f"estimator {kind!r}: unknown option {name!r}; allowed: {listed}"
-                f"{did_you_mean(name, [*allowed, *EstimatorSpec.reserved])}"
-            )
-    for parameter in parameters:
-        if parameter.name not in options and parameter.default is inspect.Parameter.empty:
-            raise UsageError(f"estimator {kind!r}: option {parameter.name!r} is missing")
-    checked = {}
-    for name, value in options.items():
-        try:
-            checked[name] = TypeAdapter(hints.get(name, Any)).validate_python(value, strict=True)
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            given = first["input"]
-            raise UsageError(f"estimator {kind!r}: {name}: got {given!r}; {first['msg'].lower()}") from None
-    return checked
+    """``plugins.checked_options`` of an estimator of that kind. Raises UsageError."""
+    return plugins.checked_options(f"estimator {kind!r}", factory, options, EstimatorSpec.reserved)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from testbed.channel.service import is_timed
 from testbed.errors import RunFailed, UsageError
+from testbed.estimator.buffers import acks_of, buffer_of
 from testbed.estimator.handover import give, start
 from testbed.estimator.model import Ack, Estimate, Estimator, Restartable, seen
 from testbed.estimator.refilter import LateObservation, Refilter
@@ -21,9 +21,6 @@ from testbed.wire.handover import Order, answered
 from testbed.wire.messages import Acknowledgement, Control, EstimateMessage, Observation, Packet
 from testbed.wire.node import OPEN, Gate, Node
 from testbed.wire.setup import Setup
-
-BUFFER = 20
-"""Steps that an estimator can go back, unless its table says otherwise, where observations or ACKs can be late."""
 
 
 def role_of(name: str) -> str:
@@ -37,19 +34,6 @@ def builder(name: str, spec: EstimatorSpec | None = None) -> Any:
 
 def spec_of(scenario: Scenario, name: str) -> EstimatorSpec:
     return next(spec for spec in scenario.estimators if spec.name == name)
-
-
-def acks_of(scenario: Scenario, spec: EstimatorSpec) -> str:
-    """Where an estimator's ACKs come from: "none", "perfect" or "link"."""
-    return spec.acks if spec.acks is not None else scenario.links.ack.mode
-
-
-def buffer_of(scenario: Scenario, spec: EstimatorSpec) -> int:
-    """Steps that an estimator can go back: as its table says, or as many as are of use."""
-    if spec.buffer is not None:
-        return spec.buffer
-    late = is_timed(scenario, "observation") or (acks_of(scenario, spec) == "link" and is_timed(scenario, "ack"))
-    return BUFFER if late else 0
 
 
 class _Block:

@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.numerics.lanes import Component, Matrix, Vector, matrix_of, vector_of
-from testbed.orchestrator.statistics import ERROR_FIGURES, Series, error_figures, prepare
+from testbed.orchestrator.cost import CostBook
+from testbed.orchestrator.lane_windows import window_ends
+from testbed.orchestrator.lanes_file import LaneFigures
+from testbed.orchestrator.statistics import ERROR_FIGURES, LANE_FIGURES, Series, error_figures, prepare
 from testbed.wire.setup import Setup
 
 Arrays = dict[str, NDArray[Any]]
@@ -45,7 +48,8 @@ class Collector:
         self._words = {name: f"estimate of {name}" for name in self._until}
         self._with_bounds = scenario.bounds
         self._count = scenario.steps
-        self.estimators = {spec.name: Series(ERROR_FIGURES, scenario.lanes) for spec in scenario.estimators}
+        self._windows = window_ends(scenario.steps, scenario.lanes, self._until.values())
+        self.estimators = {spec.name: self._new_series() for spec in scenario.estimators}
         self.bounds = Series(("lower", "upper", "upper_correlated"), scenario.lanes)
         self.completed = 0
         self.estimated = 0
@@ -53,6 +57,11 @@ class Collector:
         """The largest |x_k| of any lane and entry, at each completed step."""
         self.applied = 0
         """Lane-packets of control that the plant says it applied."""
+        self.cost = (
+            CostBook(scenario.cost, scenario.system, scenario.steps, scenario.lanes, self._windows)
+            if scenario.cost
+            else None
+        )
         self._plan()
         self._steps: dict[int, _Step] = {}
 
@@ -68,9 +77,8 @@ class Collector:
         """
         if name not in self._until:
             self._first[name], self._words[name] = first, f"estimate of {name}"
-            self.estimators[name] = series = Series(ERROR_FIGURES, self._setup.scenario.lanes)
-            for step in range(1, self.completed + 1):
-                series.close(step)
+            self.estimators[name] = series = self._new_series()
+            series.begin_at(first, self.completed)
         self._until[name] = last
         self._plan()
 
@@ -84,6 +92,8 @@ class Collector:
         largest = max(map(abs, x)) if isinstance(x[0], float) else float(np.abs(arrays["x"]).max())
         record.largest = max(record.largest, largest)
         self.applied += int(np.count_nonzero(arrays["nu"]))
+        if self.cost is not None:
+            self.cost.add(step, lane, x, arrays.get("applied"))
         for name, x_hat, P in record.early.pop(lane, ()):
             self._reduce(name, step, lane, x, x_hat, P)
         self._done(record, lane, TRUTH)
@@ -107,6 +117,14 @@ class Collector:
         self.bounds.add(step, lane, figures)
         self._done(self._of(step), lane, BOUNDS)
 
+    def by_lane(self) -> LaneFigures:
+        """The figures of each lane, over the windows of completed steps."""
+        ends = np.array([end for end in self._windows if end <= self.completed], dtype=np.int64)
+        lasts = {name: min(until, self.completed) for name, until in self._until.items()}
+        estimators = {name: series.by_lane(lasts[name]) for name, series in self.estimators.items()}
+        whole = {} if self.cost is None else {"cost": self.cost.series.by_lane(self.completed)["step"]}
+        return LaneFigures(ends, estimators, whole)
+
     def awaiting(self) -> str:
         """What the oldest incomplete step still waits for."""
         record = self._steps.get(self.completed + 1) or self._record(self.completed + 1)
@@ -115,6 +133,9 @@ class Collector:
 
     def _reduce(self, name: str, step: int, lane: int, x: Vector, x_hat: Vector, P: Matrix) -> None:
         self.estimators[name].add(step, lane, error_figures(x, x_hat, P))
+
+    def _new_series(self) -> Series:
+        return Series(ERROR_FIGURES, self._setup.scenario.lanes, kept=len(LANE_FIGURES), ends=self._windows)
 
     def _parts_at(self, step: int) -> tuple[frozenset[str], int]:
         """What a block of lanes has at a step, and how many of it are estimates."""
@@ -134,7 +155,9 @@ class Collector:
 
     def _plan(self) -> None:
         """What each step consists of, after a change of who estimates when."""
-        self._series = (*self.estimators.values(), self.bounds)
+        self._series: list[Series | CostBook] = [*self.estimators.values(), self.bounds]
+        if self.cost is not None:
+            self._series.append(self.cost)
         self._last_estimate = max(self._until.values(), default=0)
         begins = {first - 1 for first in self._first.values()}
         self._ends = sorted({*self._until.values(), *begins, self._count})

@@ -11,8 +11,9 @@ from typing import Any, Literal, cast, get_args
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from testbed.channel.service import is_timed
+from testbed.channel.real.check import check_link
 from testbed.channel.service import role_of as link_role
+from testbed.control.service import ROLE as CONTROLLER
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.bounds_service import ROLE as BOUNDS
 from testbed.orchestrator.collect import Collector
@@ -20,7 +21,6 @@ from testbed.orchestrator.preflight import plan_of
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.services import Services
 from testbed.orchestrator.summary import Happened
-from testbed.plant.controller import ROLE as CONTROLLER
 from testbed.plant.service import ROLE as PLANT
 from testbed.scenario.changes import in_turn
 from testbed.scenario.events import LinkEvent
@@ -145,7 +145,8 @@ class Conductor:
         event = Happened(step=self._granted + 1, by="command", link=link, set=change)
         events = sorted((e for e in [*self.events, event] if e.link == link), key=lambda e: e.step)
         after = in_turn(getattr(self.setup.scenario.links, link), [e.set or {} for e in events])
-        if any(variant.takes_time for variant in after) and not is_timed(self.setup.scenario, name):
+        check_link(self.setup.scenario, name, after[-1])
+        if any(variant.takes_time for variant in after) and not self.setup.scenario.takes_time(name):
             raise UsageError(
                 f"link {link!r} began without time: allowed in this run: another loss; for more, begin with a delay, "
                 "such as { kind = 'constant', by = '0 s' }"
@@ -242,7 +243,8 @@ class Conductor:
         node, keys, scenario = self.node, self.node.keys, self.setup.scenario
         for role in self._roles:
             node.on(keys.status(role), Status, role, partial(self._status, role))
-        node.on(keys.truth, Truth, PLANT, self._truth)
+        needs = ("applied",) if self.setup.costs_input else ()
+        node.on(keys.truth, Truth, PLANT, self._truth, needs=needs)
         for spec in scenario.estimators:
             self._take_estimates(spec.name, OPEN)
         if scenario.bounds:

@@ -16,14 +16,21 @@ from testbed.analysis.consistency import chi_square_band
 from testbed.analysis.moments import finite_moment_order, spectral_radius
 from testbed.channel.hidden import Hidden
 from testbed.channel.in_time import law_of_link
+from testbed.control.optimality import statement
+from testbed.control.registry import lqg_gains
+from testbed.control.service import ROLE as CONTROLLER
 from testbed.estimator.bounds import held_factor
+from testbed.estimator.buffers import acks_of, largest_buffer
 from testbed.estimator.registry import model_of
-from testbed.estimator.service import acks_of
+from testbed.numerics.lanes import constant
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.services import Turn
 from testbed.orchestrator.summary import (
+    Z_95,
     BoundFigures,
     Check,
+    ControllerFigures,
+    CostFigures,
     EstimatorFigures,
     LinkFigures,
     Summary,
@@ -32,7 +39,7 @@ from testbed.orchestrator.summary import (
 )
 from testbed.orchestrator.transient import with_transients
 from testbed.plant.inputs import control_bound
-from testbed.scenario import Scenario
+from testbed.scenario import ClosedLoop, FeedbackInput, LqgInput, Scenario
 from testbed.wire.messages import Status
 from testbed.wire.node import ORCHESTRATOR
 
@@ -68,6 +75,8 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
             "reason": broken or reason,
             "estimators": estimators,
             "bounds": bounds,
+            "controller": _controller(conductor),
+            "cost": _cost(conductor),
             "links": links,
             "events": with_transients(happened, scenario, conductor.services.turns, estimators),
             "checks": checks,
@@ -94,6 +103,7 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
         in_flight=counters.get("in_flight", 0),
         corrupted=counters.get("corrupted", 0),
         causes=causes or losses,
+        real={key.removeprefix("real_"): n for key, n in counters.items() if key.startswith("real_")},
         transitions=Transitions.model_validate({key: counters[key] for key in ("00", "01", "10", "11")}),
         loss_rate=(sent - min(sent, counters["delivered"] + counters.get("in_flight", 0))) / sent if sent else None,
         mean_burst=(counters["00"] + bursts) / bursts if bursts else None,
@@ -102,7 +112,7 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
 
 def moment_checks(scenario: Scenario) -> list[Check]:
     """Whether the EEC and the variance of its sample mean can be finite."""
-    A, losses = np.array(scenario.system.A), law_of_link(scenario, "observation")
+    A, losses = np.array(scenario.system.A), law_of_link(scenario, "observation", largest_buffer(scenario))
     order, rho, decay = finite_moment_order(A, losses), spectral_radius(A), losses.burst_decay
     hidden = isinstance(losses, Hidden)
     burst = f"θ = {decay:.6g}" if hidden else f"P(arrival after a loss) = {losses.recovery:.6g}"
@@ -249,6 +259,42 @@ def _counters(name: str, services: Mapping[str, Sequence[Turn]], reports: Mappin
         if (after is None or not after.carried) and turn.role not in elsewhere:
             total.update(reports.get(turn.role, _SILENT).counters)
     return dict(total)
+
+
+def _controller(conductor: Conductor) -> ControllerFigures | None:
+    scenario, source = conductor.setup.scenario, conductor.setup.scenario.input
+    if not isinstance(source, ClosedLoop):
+        return None
+    gain = source.gain if isinstance(source, FeedbackInput) else None
+    if isinstance(source, LqgInput):
+        gain = constant(lqg_gains(source, model_of(scenario), scenario.steps)[-1])
+    return ControllerFigures(
+        kind=source.kind,
+        estimator=source.estimator,
+        gain=gain,
+        statement=statement(scenario),
+        counters=conductor.reports.get(CONTROLLER, _SILENT).counters,
+    )
+
+
+def _cost(conductor: Conductor) -> CostFigures | None:
+    book, steps = conductor.collector.cost, conductor.collector.completed
+    if book is None:
+        return None
+    figures = {f"{key}_mean": values for key, values in book.series.mean.items()}
+    figures |= {f"{key}_stderr": values for key, values in book.series.stderr.items()}
+    _, total, stderr = book.total()
+    interval = None if total is None or stderr is None else (total - Z_95 * stderr, total + Z_95 * stderr)
+    return CostFigures.model_validate(
+        {
+            **figures,
+            "total": total,
+            "total_stderr": stderr,
+            "total_interval_95": interval,
+            "a_step": None if total is None else total / steps,
+            "a_step_stderr": None if stderr is None else stderr / steps,
+        }
+    )
 
 
 def _bounds(conductor: Conductor) -> BoundFigures | None:

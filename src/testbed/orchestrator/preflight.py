@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from testbed.control.registry import check as check_controller
 from testbed.errors import UsageError
+from testbed.estimator.buffers import acks_of
 from testbed.estimator.model import Model, Restartable
 from testbed.estimator.registry import check, checked_options, create, factory_of, model_of
-from testbed.estimator.service import acks_of
-from testbed.scenario import EstimatorSpec, FeedbackInput, Scenario
+from testbed.scenario import ClosedLoop, EstimatorSpec, Scenario
+from testbed.scenario.backend import real_links
 from testbed.scenario.base import Part
 from testbed.scenario.events import AddEvent, RemoveEvent, ShadowEvent, SwapEvent
 from testbed.scenario.explain import explain
@@ -24,8 +26,11 @@ if TYPE_CHECKING:
     from testbed.orchestrator.services import Services
 
 
-def check_estimators(scenario: Scenario) -> None:
-    """Raises UsageError for an estimator that does not exist, has wrong options, or cannot run in this scenario."""
+def check_parts(scenario: Scenario) -> None:
+    """Raises UsageError for an estimator that does not exist, has wrong options, or cannot run in this scenario.
+
+    The same for the controller of a closed loop.
+    """
     if not scenario.estimators:
         raise UsageError("the scenario has no [[estimators]]; a run needs at least one")
     model = model_of(scenario)
@@ -33,6 +38,18 @@ def check_estimators(scenario: Scenario) -> None:
         check(spec, model, acks=acks_of(scenario, spec), scenario=scenario)
     for plan in scenario.swaps:
         check_change(plan, scenario, model)
+    check_controller(scenario)
+
+
+def check_processes(scenario: Scenario) -> None:
+    """Raises UsageError for links that need real time and processes, where there are none."""
+    names = real_links(scenario)
+    if names:
+        backend = getattr(scenario.links, names[0]).backend
+        raise UsageError(
+            f"links.{names[0]}.backend: got {backend!r} with --in-process; allowed there: model (--links model), or "
+            "without --in-process"
+        )
 
 
 def check_change(plan: Planned, scenario: Scenario, model: Model) -> None:
@@ -82,7 +99,7 @@ def plan_of(setup: Setup, services: Services, event: dict[str, Any], step: int) 
         raise UsageError(explain(error, _Asked).removeprefix("events[0]").lstrip(".: ")) from None
     waiting = [(p.plan.event, p.step if p.step is not None else step) for p in services.pending]
     source = scenario.input
-    followed = source.estimator if isinstance(source, FeedbackInput) else None
+    followed = source.estimator if isinstance(source, ClosedLoop) else None
     timeline = [*services.made, *waiting, (made, step)]
     try:
         plans = planned(scenario.estimators, timeline, steps=scenario.steps, followed=followed)

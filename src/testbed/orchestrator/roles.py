@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import get_args
 
 from testbed.channel import service as link_service
+from testbed.control import service as control_service
 from testbed.estimator import bounds_service
 from testbed.estimator import service as estimator_service
-from testbed.plant import controller
 from testbed.plant import service as plant_service
 from testbed.scenario import Scenario
 from testbed.wire.keys import LinkName
@@ -28,7 +28,7 @@ class RoleSpec:
 def roles_of(scenario: Scenario) -> list[RoleSpec]:
     """Every role of a scenario but the orchestrator."""
     roles = [
-        RoleSpec(controller.ROLE, controller.build, "testbed.plant.controller"),
+        RoleSpec(control_service.ROLE, control_service.build, "testbed.control"),
         RoleSpec(plant_service.ROLE, plant_service.PlantService, "testbed.plant"),
     ]
     for link in get_args(LinkName):

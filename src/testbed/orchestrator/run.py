@@ -13,11 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
+from testbed.channel.real.check import check_links
 from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.interrupts import Interrupts, noted
+from testbed.orchestrator.lanes_file import NAME as LANES
+from testbed.orchestrator.lanes_file import LaneFigures, write_lanes
 from testbed.orchestrator.outcome import summarise
-from testbed.orchestrator.preflight import check_estimators, prepare_folder
+from testbed.orchestrator.preflight import check_parts, check_processes, prepare_folder
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.roles import RoleSpec, roles_of
 from testbed.orchestrator.running import published
@@ -52,7 +55,8 @@ class Run:
         self, scenario: Scenario, out: Path, *, progress: Progress = _no_progress, say: Callable[[str], None] = _silent
     ) -> None:
         """Raises UsageError where the scenario cannot run or the folder cannot be written, before anything starts."""
-        check_estimators(scenario)
+        check_parts(scenario)
+        check_links(scenario)
         prepare_folder(out)
         self._out, self._progress, self._say = out, progress, say
         self._setup = Setup(secrets.token_hex(6), scenario)
@@ -107,7 +111,11 @@ class Run:
 
     @np.errstate(all="ignore")
     def in_process(self, schedule: int | None = None) -> Summary:
-        """On the in-process bus; ``schedule`` seeds the order in which messages to different roles are delivered."""
+        """On the in-process bus; ``schedule`` seeds the order in which messages to different roles are delivered.
+
+        Raises UsageError where a link needs real time and processes.
+        """
+        check_processes(self._setup.scenario)
         network = MemoryNetwork(schedule)
         recorder = self._recorder()
         conductor = self._conductor(network.bus(), recorder)
@@ -236,7 +244,7 @@ class Run:
         else:
             status, reason = "complete", None
         summary = summarise(conductor, status=status, reason=reason, timing=timing)
-        write_results(self._out, summary, self._setup.scenario)
+        write_results(self._out, summary, self._setup.scenario, conductor.collector.by_lane())
         return summary
 
 
@@ -250,14 +258,15 @@ def _drain(network: MemoryNetwork, until: Callable[[], bool]) -> None:
             continue
 
 
-def write_results(out: Path, summary: Summary, scenario: Scenario) -> None:
-    """scenario.toml, summary.json and report.html. Raises RunFailed where the disk refuses."""
+def write_results(out: Path, summary: Summary, scenario: Scenario, lanes: LaneFigures) -> None:
+    """scenario.toml, summary.json, lanes.npz and report.html. Raises RunFailed where the disk refuses."""
     from testbed.orchestrator.report import write_report
 
     toml = to_toml(scenario)
     try:
         (out / "scenario.toml").write_text(toml)
         write_summary(out / "summary.json", summary)
+        write_lanes(out / LANES, lanes)
         write_report(out / "report.html", summary, toml)
     except OSError as error:
         raise RunFailed(f"cannot write the results into {out}: {error.strerror}") from None

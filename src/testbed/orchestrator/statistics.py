@@ -8,11 +8,25 @@ from functools import lru_cache
 
 import numpy as np
 
-from testbed.numerics.lanes import Cholesky, Component, Matrix, Vector, dot, many_lanes, one_lane, subtract, trace
+from testbed.numerics.lanes import (
+    Cholesky,
+    Component,
+    Floats,
+    Matrix,
+    Vector,
+    dot,
+    many_lanes,
+    one_lane,
+    subtract,
+    trace,
+)
 from testbed.numerics.moments import LaneMoments, Result
 from testbed.numerics.symbols import Shape
+from testbed.orchestrator.lane_windows import LaneWindows
 
-ERROR_FIGURES = ("trace_P", "squared_error", "nees", "excess")
+LANE_FIGURES = ("trace_P", "squared_error", "nees")
+"""Those that are kept of each lane."""
+ERROR_FIGURES = (*LANE_FIGURES, "excess")
 Figures = dict[str, Component]
 
 
@@ -44,10 +58,15 @@ def _compute(n: int, lanes: int) -> Callable[..., tuple[Component, ...]]:
 
 
 class Series:
-    """Mean and standard error over lanes of some figures along k; a step's lanes may come in any blocks and order."""
+    """Mean and standard error over lanes of some figures along k; a step's lanes may come in any blocks and order.
 
-    def __init__(self, names: tuple[str, ...], lanes: int) -> None:
+    ``kept``: how many of the first of them are kept of each lane, averaged over windows of steps with these ``ends``.
+    """
+
+    def __init__(self, names: tuple[str, ...], lanes: int, *, kept: int = 0, ends: tuple[int, ...] = ()) -> None:
         self.names, self._lanes = names, lanes
+        self._kept = names[:kept]
+        self._windows = LaneWindows(ends, kept, lanes) if kept else None
         self._open: dict[int, Figures | LaneMoments] = {}
         self._closed: list[Figures | list[Result] | None] = []
 
@@ -61,7 +80,16 @@ class Series:
             moments = self._open[step] = LaneMoments(len(self.names), self._lanes)
         assert isinstance(moments, LaneMoments)
         absent = np.full(np.shape(next(iter(figures.values()))), np.nan)
-        moments.add(lane, np.array([figures.get(name, absent) for name in self.names]).reshape(len(self.names), -1))
+        values = np.array([figures.get(name, absent) for name in self.names]).reshape(len(self.names), -1)
+        moments.add(lane, values)
+        if self._windows is not None:
+            self._windows.add(step, lane, values)
+
+    def begin_at(self, first: int, completed: int) -> None:
+        """There are no figures before step ``first``; so many steps are complete already."""
+        self._closed += [None] * completed
+        if self._windows is not None:
+            self._windows.begin_at(first)
 
     def close(self, step: int) -> None:
         """The next step is complete: keep its figures and forget the sums."""
@@ -86,6 +114,20 @@ class Series:
         results = self._results()["nees"]
         there = [result for result, closed in zip(results, self._closed, strict=True) if closed is not None]
         return self._lanes * len(there) - sum(count for count, _, _ in there)
+
+    def by_lane(self, last: int) -> dict[str, Floats]:
+        """Of each figure that is kept of each lane: its means over the windows up to a closed step, (windows, lanes).
+
+        Not finite where a step has no value.
+        """
+        assert self._windows is not None
+        windows = self._windows
+        if self._lanes == 1:  # nothing was added on the way: the steps are all here
+            windows = LaneWindows(windows.ends, len(self._kept), 1)
+            rows = [row if isinstance(row, dict) else {} for row in self._closed[:last]]
+            windows.add_from_start(np.array([[row.get(name, math.nan) for row in rows] for name in self._kept]))
+        means = windows.means(last)
+        return {name: means[:, i] for i, name in enumerate(self._kept)}
 
     def _results(self) -> dict[str, list[Result]]:
         rows = [[_ABSENT] * len(self.names) if row is None else self._row(row) for row in self._closed]

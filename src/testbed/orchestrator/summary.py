@@ -98,6 +98,39 @@ class BoundFigures(_Model):
         return self.upper_mean if self.upper_reason is None else None
 
 
+class CostFigures(_Model):
+    """The quadratic cost J = Σ_{k=1}^{steps} c_k, c_k = (x_k − r)'Qx(x_k − r) + a_{k−1}'Ru a_{k−1}, over lanes.
+
+    a is the input that the plant applied, not the one that was sent.
+    """
+
+    step_mean: Series = Field(description="c_k")
+    step_stderr: Series
+    state_mean: Series = Field(description="(x_k − r)'Qx(x_k − r)")
+    state_stderr: Series
+    input_mean: Series = Field(description="a_{k−1}'Ru a_{k−1}")
+    input_stderr: Series
+    total: Number = Field(default=None, description="mean over lanes of J, over the completed steps")
+    total_stderr: Number = Field(default=None, description="its standard error: the steps of a lane are summed first")
+    total_interval_95: tuple[Number, Number] | None = Field(default=None, description="total ± 1.96 standard errors")
+    a_step: Number = Field(default=None, description="total / completed steps")
+    a_step_stderr: Number = Field(default=None, description="total_stderr / completed steps")
+
+
+class ControllerFigures(_Model):
+    """The controller of a closed loop."""
+
+    kind: str = Field(description="kind of the input")
+    estimator: str = Field(description="whose estimate it follows")
+    gain: tuple[tuple[float, ...], ...] | None = Field(
+        default=None, description="L of u_k = −L x̂_k, with a finite horizon that of k = 0; null: it has no such gain"
+    )
+    statement: str | None = Field(default=None, description="of an LQG controller: whether it is optimal, or why not")
+    counters: dict[str, NonNegativeInt] = Field(
+        default_factory=dict, description="saturated: lane-steps at which the input was cut to its limits"
+    )
+
+
 class Transitions(_Model):
     """Pairs of neighbouring packets of one lane: 0 lost, 1 delivered. In JSON the keys are 00, 01, 10, 11."""
 
@@ -122,6 +155,11 @@ class LinkFigures(_Model):
     causes: dict[str, NonNegativeInt] = Field(default_factory=dict, description="those dropped, by cause")
     transport: dict[str, NonNegativeInt] = Field(
         default_factory=dict, description="what connections did: retransmissions, recoveries, timeouts, probes, …"
+    )
+    real: dict[str, NonNegativeInt] = Field(
+        default_factory=dict,
+        description="of a link through real sockets: packets that left more than a period late (behind), and the books "
+        "of its packets, forward and backward",
     )
     transitions: Transitions = Transitions()
     loss_rate: Number = None
@@ -214,6 +252,8 @@ class Summary(_Model):
     reason: str | None = None
     estimators: dict[str, EstimatorFigures]
     bounds: BoundFigures | None = None
+    controller: ControllerFigures | None = Field(default=None, description="of a closed loop; null: it is open")
+    cost: CostFigures | None = Field(default=None, description="the quadratic cost; null: the scenario has no weights")
     links: dict[str, LinkFigures]
     events: tuple[Happened, ...] = Field(default=(), description="what changed while the run went, in order of time")
     checks: tuple[Check, ...] = ()
@@ -234,9 +274,11 @@ class Summary(_Model):
         parts: dict[str, BaseModel] = {f"estimators.{name}": figures for name, figures in self.estimators.items()}
         if self.bounds is not None:
             parts["bounds"] = self.bounds
+        if self.cost is not None:
+            parts["cost"] = self.cost
         for where, part in parts.items():
             for field, value in part:
-                if field.endswith(("_mean", "_stderr")) and value is not None:
+                if field.endswith(("_mean", "_stderr")) and isinstance(value, tuple):
                     yield f"{where}.{field}", value
 
 

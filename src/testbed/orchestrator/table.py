@@ -10,7 +10,7 @@ from rich.text import Text
 
 from testbed.orchestrator.report import text
 from testbed.orchestrator.report.derived import common_band, settled
-from testbed.orchestrator.summary import Summary
+from testbed.orchestrator.summary import CostFigures, Summary
 
 
 def end_table(summary: Summary, directory: Path) -> RenderableType:
@@ -23,6 +23,8 @@ def end_table(summary: Summary, directory: Path) -> RenderableType:
     parts: list[RenderableType] = [_headline(summary)]
     if summary.estimators:
         parts += [_estimators(summary), *_notes(summary)]
+    if summary.cost is not None and summary.completed_steps:
+        parts.append(_cost(summary, summary.cost))
     if summary.links:
         parts.append(_links(summary))
     for event in summary.events:
@@ -75,6 +77,17 @@ def _notes(summary: Summary) -> list[RenderableType]:
         if tail is not None and tail.missing:
             notes.append(_line("note", f"{name} has no finite tr P at {tail.missing} of its steps", "bold yellow"))
     return notes
+
+
+def _cost(summary: Summary, cost: CostFigures) -> Text:
+    line = f"cost: {text.plus_minus(cost.a_step, cost.a_step_stderr)} a step, "
+    line += f"{text.plus_minus(cost.total, cost.total_stderr)} in all"
+    controller = summary.controller
+    if controller is None:
+        return Text(line)
+    saturated = controller.counters.get("saturated", 0)
+    at_limits = f", {text.count(saturated)} at a limit" if saturated else ""
+    return Text(f"{line} ({controller.kind} on {controller.estimator}{at_limits})")
 
 
 def _links(summary: Summary) -> Table:

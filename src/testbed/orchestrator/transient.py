@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from testbed.estimator.service import acks_of
+from testbed.estimator.buffers import acks_of
 from testbed.orchestrator.preflight import settings_of
 from testbed.orchestrator.services import Turn
 from testbed.orchestrator.summary import EstimatorFigures, Happened, Transient

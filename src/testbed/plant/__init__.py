@@ -1,1 +1,1 @@
-"""The plant: dynamics, sensor, actuator; the inputs and the controller."""
+"""The plant: dynamics, sensor, actuator; the inputs."""

@@ -59,7 +59,9 @@ class Plant:
         spread = constant_times(constant(root(np.array(system.P0))), stream("initial", system.n).normals(0))
         self.x: Vector = [m + s for m, s in zip(system.x0_mean, spread, strict=True)]
         self._noise: Vector = []
+        self._applied: Vector = full_vector(np.zeros(system.q), lanes)
         self._k = 0
+        self._keeps_applied = scenario.cost is not None
         self._held = full_vector(np.zeros(system.q), lanes) if scenario.actuator.on_loss == "hold" else None
         self._everywhere: Mask = True if lanes == 1 else np.ones(lanes, dtype=np.bool_)
         if uncertainty is not None and self._derivatives is not None:
@@ -77,6 +79,11 @@ class Plant:
         """v_k (M, p) of the last observation."""
         return array_of(constant_times(self._matrices.sensor, self._noise), self._lanes)
 
+    @property
+    def applied(self) -> Floats:
+        """The input (M, q) of the last step: u where it arrived, elsewhere zero or what was held."""
+        return array_of(self._applied, self._lanes)
+
     def move(self, u: Floats | None, applied: Mask) -> tuple[Floats, Floats]:
         """One step: apply u (M, q) where ``applied``, elsewhere zero or what was applied last.
 
@@ -86,6 +93,8 @@ class Plant:
         if self._held is not None:
             self._held = control = where_vector(applied, control, self._held)
             applied = self._everywhere
+        if self._keeps_applied:
+            self._applied = [where(applied, c, 0.0) for c in control]
         w, v = self._process.normals(self._k), self._sensor.normals(self._k + 1)
         if self._derivatives is None:
             self.x, y = self._advance(applied, self.x, control, w, v)

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from testbed.numerics.lanes import Floats, array_of
 from testbed.numerics.streams import Stream
 from testbed.scenario import (
+    ClosedLoop,
     ConstantInput,
     ExponentialInput,
-    FeedbackInput,
     Scenario,
     SineInput,
     TableInput,
@@ -27,7 +27,7 @@ _AHEAD = 256  # steps
 def open_loop(scenario: Scenario, lane: int, lanes: int) -> InputSource:
     """The input of the lanes lane … lane + lanes − 1; it does not depend on estimates."""
     source, q = scenario.input, scenario.system.q
-    if isinstance(source, FeedbackInput):
+    if isinstance(source, ClosedLoop):
         raise TypeError("a feedback input depends on the estimate")
     if isinstance(source, UniformInput):
         stream = Stream(scenario.seed, "controller", "input", width=q, lane=lane, lanes=lanes)
@@ -79,7 +79,7 @@ def control_bound(scenario: Scenario) -> Floats | None:
     every law of an a among 0, u_0, u_1, …: channel i has a range of width d_i, so that Var(a) ≤ ¼ Σ d_i² I (Popoviciu).
     """
     source, q = scenario.input, scenario.system.q
-    if isinstance(source, FeedbackInput):
+    if isinstance(source, ClosedLoop):
         return None
     b = np.array(scenario.system.B) if scenario.system.B is not None else np.zeros((scenario.system.n, 0))
     if isinstance(source, ConstantInput):

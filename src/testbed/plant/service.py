@@ -24,6 +24,7 @@ class PlantService:
         keys = node.keys
         self._plants = {lane: Plant(setup.scenario, lane, lanes) for lane, lanes in setup.blocks}
         self._next = dict.fromkeys(self._plants, 0)
+        self._costs = setup.costs_input
         self._noise = setup.scenario.links.observation.on_loss == "noise"
         self._truth = node.sender(keys.truth, Truth, lazy=True)
         self._ack = node.sender(keys.sent("ack"), Acknowledgement, tap=True) if setup.acks_are_of_use else None
@@ -41,4 +42,7 @@ class PlantService:
         self._observe(step, lane, lanes, {"y": y, "noise": self._plants[lane].noise} if self._noise else {"y": y})
         if self._ack is not None:
             self._ack(step, lane, lanes, {"nu": nu})
-        self._truth(step, lane, lanes, {"x": x, "nu": nu})
+        truth: dict[str, NDArray[Any]] = {"x": x, "nu": nu}
+        if self._costs:
+            truth["applied"] = self._plants[lane].applied
+        self._truth(step, lane, lanes, truth)

@@ -4,12 +4,13 @@ A scenario is read once, by `load_scenario` or `parse_scenario`; what comes out 
 """
 
 from testbed.scenario.actuator import Actuator, OnLoss
+from testbed.scenario.closed_loop import ClosedLoop, FeedbackInput, LqgInput, PidInput, PythonInput
+from testbed.scenario.cost import Cost
 from testbed.scenario.durations import format_duration, parse_duration
 from testbed.scenario.estimators import EstimatorSpec
 from testbed.scenario.inputs import (
     ConstantInput,
     ExponentialInput,
-    FeedbackInput,
     Input,
     SineInput,
     TableInput,
@@ -26,7 +27,7 @@ from testbed.scenario.loss_laws import (
     NoLoss,
 )
 from testbed.scenario.losses import Loss
-from testbed.scenario.models import Scenario
+from testbed.scenario.models import Following, Scenario
 from testbed.scenario.replays import ScriptedLoss, TraceLoss
 from testbed.scenario.schema import scenario_json_schema
 from testbed.scenario.system import System
@@ -39,10 +40,13 @@ __all__ = [
     "Actuator",
     "BernoulliLoss",
     "Clock",
+    "ClosedLoop",
     "ConstantInput",
+    "Cost",
     "EstimatorSpec",
     "ExponentialInput",
     "FeedbackInput",
+    "Following",
     "FourStateLoss",
     "GilbertElliottLoss",
     "Input",
@@ -50,10 +54,13 @@ __all__ = [
     "Links",
     "Loss",
     "LossLaw",
+    "LqgInput",
     "MarkovLoss",
     "NoLoss",
     "ObservationLink",
     "OnLoss",
+    "PidInput",
+    "PythonInput",
     "Scenario",
     "ScriptedLoss",
     "SineInput",

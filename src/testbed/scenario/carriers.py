@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from testbed.scenario.base import COUNT_MAX, Count, Part, problem, shown
-from testbed.scenario.durations import Duration, DurationOrZero
+from testbed.scenario.durations import Duration, DurationOrZero, parse_duration
 
 UDP_HEADER_BYTES = 8
 IP_HEADER_BYTES = 20
@@ -44,6 +44,12 @@ class TcpTransport(Part):
         description="How long an acknowledgement may wait for a second segment; 0: each segment is acknowledged at "
         "once, as Linux does when the application reads it at once and sends nothing back.",
     )
+    keep_alive: DurationOrZero = Field(
+        default="0 s",
+        description="With delayed_ack: how often the receiving end sends something of its own. Linux delays "
+        "acknowledgements only from then on until a segment comes twice; 0: it always does. For zenoh, "
+        "delayed_ack = '40 ms' and keep_alive = '2.5 s'.",
+    )
     framing_bytes: int = Field(
         default=13, ge=0, le=65535, description="Bytes that the application's protocol adds to a message; zenoh: 13."
     )
@@ -72,6 +78,12 @@ class TcpTransport(Part):
             raise problem(
                 f"got {shown(self.buffer_bytes)}; allowed: at least mss, which is {shown(self.mss)}", "buffer_bytes"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _delayed_with_keep_alive(self) -> "TcpTransport":
+        if parse_duration(self.keep_alive, zero=True) and not parse_duration(self.delayed_ack, zero=True):
+            raise problem(f"got {shown(self.keep_alive)} without delayed_ack; allowed: only with it", "keep_alive")
         return self
 
 

@@ -46,7 +46,7 @@ class _WithOptions(Part):
                 )
         own = {key: value for key, value in data.items() if key in cls.reserved}
         rest = {key: value for key, value in data.items() if key not in cls.model_fields}
-        own["options"] = {key: _plain_value(value, key) for key, value in {**given, **rest}.items()}
+        own["options"] = plain_options({**given, **rest})
         return own
 
 
@@ -104,6 +104,11 @@ class NewService(_WithOptions):
             buffer=self.buffer if self.buffer is not None or like is None else like.buffer,
             options=self.options,
         )
+
+
+def plain_options(options: dict[str, Any]) -> dict[str, Any]:
+    """Options as TOML can hold them; a problem of validation if one is something else."""
+    return {key: _plain_value(value, key) for key, value in options.items()}
 
 
 def _plain_value(value: Any, at: str) -> Any:

@@ -5,6 +5,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from testbed.scenario.base import Matrix, Part, ScalarOrVector, Vector, count, problem, sequence, shown
+from testbed.scenario.closed_loop import ClosedLoop, FeedbackInput, LqgInput, PidInput, PythonInput
+from testbed.scenario.system import System
 
 
 def _positive(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
@@ -84,28 +86,31 @@ class TableInput(Part):
     values: Matrix = Field(description="A row of q numbers for each step k = 0, 1, …; at least as many as steps.")
 
 
-class FeedbackInput(Part):
-    """u_k = -gain x_hat_k: the loop is closed through an estimator."""
-
-    kind: Literal["feedback"] = Field(default="feedback", description="Kind of input.")
-    gain: Matrix = Field(description="Gain, q x n.")
-    estimator: str = Field(default="", description="Name of the estimator that closes the loop; default the first one.")
-
-
 Input = Annotated[
-    ConstantInput | ExponentialInput | SineInput | UniformInput | TableInput | FeedbackInput,
+    ConstantInput
+    | ExponentialInput
+    | SineInput
+    | UniformInput
+    | TableInput
+    | FeedbackInput
+    | LqgInput
+    | PidInput
+    | PythonInput,
     Field(discriminator="kind"),
 ]
 
 
-def check_channels(source: Input, q: int) -> None:
+def check_channels(source: Input, system: System) -> None:
     """Check that every list of `source` has `q` entries, one for each channel; a problem of validation if not."""
+    if isinstance(source, ClosedLoop):
+        source.check_sizes(system)
+        return
+    q = system.q
     for key in type(source).model_fields:
         value = getattr(source, key)
-        if key in ("values", "gain"):
-            width = len(value[0]) if key == "values" else len(value)
-            unit = count(width, "number") + " a row" if key == "values" else count(width, "row")
-            if width != q:
+        if key == "values":
+            if len(value[0]) != q:
+                unit = count(len(value[0]), "number") + " a row"
                 raise problem(f"got {unit}; allowed: {q}, the number of columns of system.B", key)
         elif sequence(value) is not None and len(value) != q:
             raise problem(f"got {count(len(value), 'number')}; allowed: {q}, the number of columns of system.B", key)

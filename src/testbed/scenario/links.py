@@ -50,12 +50,22 @@ def _link_schema(schema: dict[str, Any]) -> None:
     }
 
 
+Backend = Literal["model", "relay", "kernel"]
+"""What a link of a run is made of."""
+
+
 class SteppedImpairments(Impairments):
     """A link of a run, whose packets belong to steps."""
 
     model_config = ConfigDict(json_schema_extra=_link_schema)
     other_keys: ClassVar[tuple[str, ...]] = ("preset",)
 
+    backend: Backend = Field(
+        default="model",
+        description="model: simulated; relay: two real zenoh sessions with a relay between them, on the wall clock; "
+        "kernel: two real zenoh sessions in two network namespaces, on the wall clock. Real sessions talk over UDP, "
+        "with transport 'tcp' over TCP.",
+    )
     deadline: Duration | None = Field(
         default=None,
         description="Time after sending within which a packet counts for its step, at most the period; left out: the "
@@ -88,7 +98,12 @@ class SteppedImpairments(Impairments):
     def takes_time(self) -> bool:
         """Whether a packet may arrive late, twice or spoilt, or meet a chain that is not moved by packets."""
         stages = (self.slot, self.rate, self.delay, self.reorder, self.duplicate, self.corrupt, self.transport)
-        return any(stage is not None for stage in stages)
+        return self.is_real or any(stage is not None for stage in stages)
+
+    @property
+    def is_real(self) -> bool:
+        """Whether its packets go through real sockets, in real time."""
+        return self.backend != "model"
 
     def deadline_ns(self, period_ns: int) -> int:
         """The deadline in nanoseconds."""
@@ -143,14 +158,16 @@ class Links(Part):
     observation: ObservationLink = Field(default_factory=ObservationLink, description="Plant to estimators: y.")
     ack: AckLink = Field(default_factory=AckLink, description="Plant to estimators: which u were applied.")
 
-    def of_run(self, packets: int) -> "Links":
+    def of_run(self, packets: int, period_ns: int) -> "Links":
         """For a run of so many packets a link: replayed losses with their law. A problem of validation if one ends."""
         update = {}
         for name in type(self).model_fields:
             link: Impairments = getattr(self, name)
             if isinstance(link.loss, (TraceLoss, ScriptedLoss)):
                 try:
-                    update[name] = link.model_copy(update={"loss": link.loss.of_run(packets)})
+                    slot_ns = period_ns if link.slot is None else parse_duration(link.slot)
+                    fates = packets if link.slot is None else (packets - 1) * period_ns // slot_ns + 1
+                    update[name] = link.model_copy(update={"loss": link.loss.of_run(fates)})
                 except PydanticCustomError as error:
                     context = error.context or {}
                     raise problem(context["text"], f"{name}.loss.{context['at']}") from None

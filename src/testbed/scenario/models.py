@@ -7,25 +7,38 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from testbed.errors import UsageError, did_you_mean
 from testbed.scenario.actuator import Actuator
-from testbed.scenario.base import Count, Part, count, problem, shown, size
+from testbed.scenario.base import Count, Part, count, problem, shown
 from testbed.scenario.changes import in_turn
-from testbed.scenario.durations import parse_duration
+from testbed.scenario.closed_loop import ClosedLoop, FeedbackInput, LqgInput, PidInput, PythonInput
+from testbed.scenario.cost import Cost
+from testbed.scenario.durations import format_duration, parse_duration
 from testbed.scenario.estimators import EstimatorSpec
 from testbed.scenario.events import ESTIMATOR_EVENTS, EstimatorEvent, Event, LinkEvent
-from testbed.scenario.inputs import ConstantInput, FeedbackInput, Input, TableInput, check_channels
-from testbed.scenario.links import Links, SteppedImpairments
+from testbed.scenario.inputs import ConstantInput, Input, TableInput, check_channels
+from testbed.scenario.links import AckLink, Links, SteppedImpairments
 from testbed.scenario.services import Planned, planned
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Transport
 from testbed.scenario.uncertainty import Uncertainty
 
 SEED_MAX = 2**63 - 1
+SLOTS_A_PERIOD = 1000
+"""Moves of a chain by time, from packet to packet, at most."""
+
+Following = FeedbackInput | LqgInput | PidInput | PythonInput
+"""The inputs of a closed loop."""
 
 
 def _no_input(data: dict[str, Any]) -> ConstantInput | None:
     """u = 0 if the system has an input, and nothing if it has none."""
     system: System = data["system"]
     return ConstantInput(value=(0.0,) * system.q) if system.q else None
+
+
+def _cost_of_input(data: dict[str, Any]) -> Cost | None:
+    """The cost that an LQG controller minimises; none for any other input."""
+    source = data.get("input")
+    return Cost(Qx=source.Qx, Ru=source.Ru, terminal=source.terminal) if isinstance(source, LqgInput) else None
 
 
 class Scenario(Part):
@@ -51,6 +64,10 @@ class Scenario(Part):
     )
     actuator: Actuator = Field(default_factory=Actuator, description="What the plant applies where u is lost.")
     input: Input | None = Field(default_factory=_no_input, description="The input u; default zero. Only with system.B.")
+    cost: Cost | None = Field(
+        default_factory=_cost_of_input,
+        description="What deviations and inputs cost; left out: the weights of an LQG input, or no cost.",
+    )
     links: Links = Field(default_factory=Links, description="The links between the parts.")
     transport: Transport = Field(default_factory=Transport, description="How the processes of a run talk.")
     events: Annotated[tuple[Event, ...], Field(strict=False)] = Field(
@@ -66,7 +83,7 @@ class Scenario(Part):
 
     @field_validator("estimators")
     @classmethod
-    def _check_estimators(cls, specs: tuple[EstimatorSpec, ...], info: ValidationInfo) -> tuple[EstimatorSpec, ...]:
+    def _check_parts(cls, specs: tuple[EstimatorSpec, ...], info: ValidationInfo) -> tuple[EstimatorSpec, ...]:
         names: set[str] = set()
         for i, spec in enumerate(specs):
             if spec.name in names:
@@ -81,18 +98,19 @@ class Scenario(Part):
     @classmethod
     def _check_links(cls, links: Links, info: ValidationInfo) -> Links:
         clock: Clock | None = info.data.get("clock")
-        for name in Links.model_fields if clock is not None else ():
-            deadline = getattr(links, name).deadline
-            if clock is not None and deadline is not None and parse_duration(deadline) > clock.period_ns:
-                raise problem(f"got {deadline!r}; allowed: at most the period, {clock.period!r}", f"{name}.deadline")
+        if clock is not None:
+            _check_times(links, clock)
         observation = links.observation
         if observation.on_loss == "noise" and observation.takes_time:
             raise problem(
-                "got 'noise' on a link with a delay, rate, order, copies, bit errors or a clock of its own; "
+                "got 'noise' on a link with a delay, rate, order, copies, bit errors, a transport, a clock of its own "
+                "or a real backend; "
                 "allowed there: nothing",
                 "observation.on_loss",
             )
-        return links.of_run(info.data["steps"]) if "steps" in info.data else links
+        if clock is None or "steps" not in info.data:
+            return links
+        return links.of_run(info.data["steps"], clock.period_ns)
 
     @field_validator("events")
     @classmethod
@@ -127,6 +145,12 @@ class Scenario(Part):
             raise problem("got 'hold', but system.B is not given; allowed: zero, or hold with system.B", "on_loss")
         return actuator
 
+    def takes_time(self, link: str) -> bool:
+        """Whether the link of that name takes time, at the beginning or after an event, or carries ACKs in batches."""
+        settings = getattr(self.links, link)
+        batched = isinstance(settings, AckLink) and settings.batch > 1
+        return batched or any(variant.takes_time for variant in self.variants(link))
+
     @field_validator("input")
     @classmethod
     def _check_input(cls, source: Input | None, info: ValidationInfo) -> Input | None:
@@ -137,22 +161,44 @@ class Scenario(Part):
             return _no_input(info.data)
         if system.B is None:
             raise problem(f"got kind {source.kind!r}, but system.B is not given; allowed: [input] only with system.B")
-        check_channels(source, system.q)
+        check_channels(source, system)
         if isinstance(source, TableInput) and len(source.values) < info.data.get("steps", 0):
             steps = info.data["steps"]
             raise problem(
                 f"got {count(len(source.values), 'row')}; allowed: at least {steps}, one for each step", "values"
             )
-        if isinstance(source, FeedbackInput):
-            return _closed_loop(source, system, info)
+        if isinstance(source, ClosedLoop):
+            return _closed_loop(source, info)
         return source
+
+    @field_validator("cost")
+    @classmethod
+    def _check_cost(cls, cost: Cost | None, info: ValidationInfo) -> Cost | None:
+        system: System | None = info.data.get("system")
+        if cost is not None and system is not None:
+            cost.check_sizes(system)
+        return cost
+
+
+def _check_times(links: Links, clock: Clock) -> None:
+    """A problem of validation where a deadline or a slot does not fit the period."""
+    least_ns = -(-clock.period_ns // SLOTS_A_PERIOD)
+    for name in Links.model_fields:
+        link: SteppedImpairments = getattr(links, name)
+        if link.deadline_ns(clock.period_ns) > clock.period_ns:
+            raise problem(f"got {link.deadline!r}; allowed: at most the period, {clock.period!r}", f"{name}.deadline")
+        if link.slot is not None and parse_duration(link.slot) < least_ns:
+            least = format_duration(least_ns)
+            raise problem(
+                f"got {link.slot!r}; allowed: {least!r} or more, with the period {clock.period!r}", f"{name}.slot"
+            )
 
 
 def _planned(
     events: Sequence[Event], specs: Sequence[EstimatorSpec], source: Input | None, clock: Clock, steps: int
 ) -> list[Planned]:
     """The events of estimators in the order of time; a problem of validation where one does not fit."""
-    followed = source.estimator if isinstance(source, FeedbackInput) else None
+    followed = source.estimator if isinstance(source, ClosedLoop) else None
     places = [i for i, event in enumerate(events) if isinstance(event, ESTIMATOR_EVENTS)]
     timed: list[tuple[EstimatorEvent, int]] = []
     for i in places:
@@ -184,16 +230,15 @@ def _in_time(events: Sequence[Event], link: str, clock: Clock) -> list[LinkEvent
     return sorted(of_link, key=lambda e: e.step(clock.period_ns))
 
 
-def _closed_loop(source: FeedbackInput, system: System, info: ValidationInfo) -> FeedbackInput:
+def _closed_loop(source: Following, info: ValidationInfo) -> Following:
     """`source` checked against the rest of the scenario, with the name of its estimator."""
-    rows, columns = size(source.gain)
-    if columns != system.n:
-        raise problem(f"got {rows} × {columns}; allowed: {system.q} × {system.n}", "gain")
     if "estimators" not in info.data or "steps" not in info.data:
         return source
     specs: tuple[EstimatorSpec, ...] = info.data["estimators"]
     if not specs:
-        raise problem("got no [[estimators]]; allowed: feedback only through an estimator of the scenario", "estimator")
+        raise problem(
+            f"got no [[estimators]]; allowed: {source.kind} only through an estimator of the scenario", "estimator"
+        )
     names = [spec.name for spec in specs]
     name = source.estimator or names[0]
     if name not in names:

@@ -112,6 +112,9 @@ class MemoryBus:
             if matches(key, token):
                 self._network._enqueue(self, partial(handler, token, True))
 
+    def call(self, order: Callable[[], None]) -> None:
+        self._network._enqueue(self, order)
+
     def close(self) -> None:
         self.inbox.clear()
         self._network._leave(self)

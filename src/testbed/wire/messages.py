@@ -126,12 +126,15 @@ class Acknowledgement(Packet):
 
 
 class Truth(Packet):
-    """x_k and ν_{k−1}, for the collector only, never for an estimator."""
+    """x_k and ν_{k−1}, and what was applied then, for the collector only, never for an estimator."""
 
     type: Literal["truth"] = "truth"
     ARRAYS: ClassVar[dict[str, ArrayRule]] = {
         "x": _floats("lanes", "n", text="state x_k"),
         "nu": _bits("lanes", text="ν_{k−1}"),
+        "applied": _floats(
+            "lanes", "q", required=False, text="the input a_{k−1} that was applied; only where the scenario has a cost"
+        ),
     }
 
 

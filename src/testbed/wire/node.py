@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -53,6 +54,8 @@ class Node:
         self.stopped = False
         self.payload = b""
         """The message that is being handled."""
+        self.leaving = ExitStack()
+        """What is to be done when the role leaves."""
         self._tap = tap
         self._blocks = -(-sizes.lanes // (sizes.lanes_per_packet or sizes.lanes))
         self._status_seq = 0

@@ -64,7 +64,13 @@ def _serve(bus: ZenohBus, run: str, name: str, build: Build) -> int:
     bus.express = setup.window == 1
     node = Node(bus, run, name, setup.sizes, setup.tap)
     bus.direct = setup.direct
+    with node.leaving:
+        return _play(bus, node, setup, build, orphaned)
+
+
+def _play(bus: ZenohBus, node: Node, setup: Setup, build: Build, orphaned: threading.Event) -> int:
     role: Role | None = None
+    name = node.name
     try:
         role = build(node, setup)
         bus.watch(node.keys.presence(ORCHESTRATOR), lambda _, alive: None if alive else orphaned.set())

@@ -81,6 +81,44 @@ def config(transport: Transport, mode: str, *, listen: str | None = None, connec
     return values
 
 
+def open_end(
+    *,
+    listen: str | None = None,
+    connect: str | None = None,
+    lease_ms: int,
+    blocked_ms: int,
+    open_ms: int,
+    retry_ms: int,
+) -> zenoh.Session:
+    """One end of a link between two sessions: the one that listens, or the one that connects.
+
+    lease_ms: without a sign of life for so long the connection is given up. blocked_ms: a message that waits so long
+    gives it up too. open_ms: for an attempt to connect. retry_ms: between two attempts.
+    Raises BusError when the endpoint cannot be had.
+    """
+    endpoint = listen or connect
+    values: dict[str, Any] = {
+        "mode": "router" if listen is not None else "client",
+        "listen/endpoints": [] if listen is None else [listen],
+        "connect/endpoints": [] if connect is None else [connect],
+        "connect/timeout_ms": open_ms,
+        "connect/exit_on_failure": True,
+        "connect/retry": {"period_init_ms": retry_ms, "period_max_ms": retry_ms, "period_increase_factor": 1},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/unicast/open_timeout": open_ms,
+        "transport/unicast/accept_timeout": open_ms,
+        "transport/link/tx/lease": lease_ms,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": blocked_ms * 1000,
+        "transport/shared_memory/enabled": False,
+    }
+    try:
+        return _opened(values)
+    except zenoh.ZError as error:
+        what = "listen on" if listen is not None else "connect to"
+        raise BusError(f"cannot {what} {endpoint}: {_reason(error)}") from None
+
+
 @contextmanager
 def closing(session: zenoh.Session) -> Iterator[zenoh.Session]:
     """Close a session at the end, and remove the names of the shared memory it used, which zenoh leaves for later."""
@@ -102,8 +140,12 @@ def _segments() -> set[Path]:
 
 
 def _open(transport: Transport, mode: str, *, listen: str | None = None, connect: str | None = None) -> zenoh.Session:
+    return _opened(config(transport, mode, listen=listen, connect=connect))
+
+
+def _opened(values: dict[str, Any]) -> zenoh.Session:
     settings = zenoh.Config()
-    for path, value in config(transport, mode, listen=listen, connect=connect).items():
+    for path, value in values.items():
         settings.insert_json5(path, json.dumps(value))
     return zenoh.open(settings)
 

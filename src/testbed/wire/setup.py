@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
-from testbed.scenario import FeedbackInput, Scenario, Transport, parse_scenario, to_toml
+from testbed.scenario import ClosedLoop, Scenario, Transport, parse_scenario, to_toml
+from testbed.scenario.backend import real_links
 from testbed.wire.codec import Sizes
 from testbed.wire.node import Node
 
 _WINDOW_MAX = 256
 _BYTES_IN_FLIGHT = 24_000_000
+_REAL_WINDOW = 8  # steps
 _CLOSED_LOOP_CREDIT = 64  # steps
 _DIRECT_MAX = 8_192  # bytes
 _SHARED_MIN = 65_536  # bytes of the largest packet from which shared memory pays
@@ -40,15 +42,20 @@ class Setup:
 
     @property
     def closed_loop(self) -> bool:
-        return isinstance(self.scenario.input, FeedbackInput)
+        return isinstance(self.scenario.input, ClosedLoop)
 
     @cached_property
     def window(self) -> int:
-        """Steps in flight at most: 1 in a closed loop; else the scenario's, or as many as fit into a few megabytes."""
+        """Steps in flight at most: 1 in a closed loop; else the scenario's, or as many as fit into a few megabytes.
+
+        In real time a few are enough, and what is known of them is not to wait behind what is to be sent later.
+        """
         if self.closed_loop:
             return 1
         if self.scenario.clock.window is not None:
             return self.scenario.clock.window
+        if real_links(self.scenario):
+            return _REAL_WINDOW
         n, p, q = self.sizes.n, self.sizes.p, self.sizes.q
         bytes_a_step = 8 * self.scenario.lanes * (2 * q + 2 * p + 2 * n + n * n)
         return max(4, min(_WINDOW_MAX, _BYTES_IN_FLIGHT // bytes_a_step))
@@ -92,6 +99,11 @@ class Setup:
         specs = [*s.estimators, *(planned.spec for planned in s.swaps)]
         told = any(spec is not None and spec.acks == "perfect" for spec in specs)
         return s.links.ack.mode != "none" or s.record != "none" or told
+
+    @property
+    def costs_input(self) -> bool:
+        """Whether the collector needs the input that was applied."""
+        return self.scenario.cost is not None and self.sizes.q > 0
 
     def to_json(self) -> bytes:
         return json.dumps({"run": self.run, "scenario": to_toml(self.scenario)}).encode()

@@ -137,6 +137,9 @@ class ZenohBus:
         liveliness = self._session.liveliness()
         self._declared.append(liveliness.declare_subscriber(key, self._into_inbox(handle), history=True))
 
+    def call(self, order: Callable[[], None]) -> None:
+        self._inbox.put((_obey, order))
+
     def close(self) -> None:
         self.flush()
         self._session.close()  # type: ignore[no-untyped-call]
@@ -189,6 +192,10 @@ class ZenohBus:
 def _keep_thread_state() -> None:
     """Of a thread that is not Python's: it would be made and freed in every call, and with it memory be mapped."""
     ctypes.pythonapi.PyGILState_Ensure()
+
+
+def _obey(order: Callable[[], None]) -> None:
+    order()
 
 
 def _raise(error: Exception) -> None:

@@ -326,3 +326,27 @@ def test_an_address_in_use_is_refused_in_one_line(tmp_path):
             UdpRelay(("127.0.0.1", 1), traces={"forward": Path(tmp_path, "none", "t.csv")})
         assert open_files() == files
         assert set(threading.enumerate()) == threads
+
+
+def test_where_checksums_are_looked_at_a_corrupted_packet_does_not_arrive():
+    corrupt = impairments(corrupt={"chance": 0.3})
+    alone = Pipeline(corrupt, 7, "link.a")
+    kept = [number for number in range(300) if all(copy.flip is None for copy in alone.send(64, 0))]
+    relay = partial(UdpRelay, forward=corrupt, seed=7, components=("link.a", "link.b"), checksummed=True)
+    with udp_ends(relay) as (link, client, target):
+        for number in range(300):
+            client.send(datagram(number))
+        assert [number_of(data) for data in received(target, len(kept))] == kept
+        assert settled(link, 300)["dropped_corrupt"] == 300 - len(kept)
+
+
+def test_the_door_can_be_shut_behind_a_client():
+    with udp_ends(UdpRelay) as (link, client, target):
+        client.send(b"first")
+        settled(link, 1)
+        link.limit_clients(1)
+        with closing(udp_socket(link.address)) as stranger:
+            stranger.send(b"garbage")
+            until(lambda: link.figures().around["refused"] == 1, "one refused")
+        client.send(b"second")
+        assert received(target, 2) == [b"first", b"second"]

@@ -10,7 +10,8 @@ from channel.scripted import MS
 from testbed.channel.tcp.congestion import Cubic, Reno, Window
 from testbed.channel.tcp.receiver import Receiver
 from testbed.channel.tcp.rtt import RoundTrips
-from testbed.channel.tcp.segment import Ack, Data
+from testbed.channel.tcp.scoreboard import News, Scoreboard
+from testbed.channel.tcp.segment import Ack, Data, Segment
 
 
 def test_the_first_round_trip_gives_the_time_out_of_rfc_6298() -> None:
@@ -78,9 +79,9 @@ def test_cubic_follows_its_curve() -> None:
 
 
 class _Acks:
-    def __init__(self, delay_ns: int = 0) -> None:
+    def __init__(self, delay_ns: int = 0, keep_alive_ns: int = 0) -> None:
         self.all: list[Ack] = []
-        self.receiver = Receiver(delay_ns, lambda ack, now_ns: self.all.append(ack))
+        self.receiver = Receiver(delay_ns, lambda ack, now_ns: self.all.append(ack), keep_alive_ns)
 
 
 @given(st.lists(st.tuples(st.integers(0, 40), st.integers(1, 10)), min_size=1, max_size=40))
@@ -117,3 +118,54 @@ def test_the_echo_is_of_the_segment_that_moved_the_left_edge(times: list[int]) -
         acks.receiver.segment(Data(k, k + 1, at), at)
     acks.receiver.segment(Data(10, 11, 99), 99)  # beyond a gap: does not count
     assert [ack.echo for ack in acks.all] == [*times, times[-1]]
+
+
+def test_the_echo_is_not_of_a_segment_from_before_the_last_acknowledgement() -> None:
+    """RFC 9293, 3.10.7.4: it is answered, and nothing else in it is looked at. One that ends there is acceptable."""
+    acks = _Acks()
+    acks.receiver.segment(Data(0, 10, 5), 5)
+    acks.receiver.segment(Data(10, 20, 6), 6)
+    acks.receiver.segment(Data(0, 10, 300), 300)
+    acks.receiver.segment(Data(10, 20, 400), 400)
+    assert [(ack.echo, ack.duplicate) for ack in acks.all] == [(5, None), (6, None), (6, (0, 10)), (400, (10, 20))]
+
+
+def test_acknowledgements_are_delayed_from_a_keep_alive_until_a_segment_comes_twice() -> None:
+    """At 25 ms something is sent back, as at every other multiple of 25 ms. The first 16 are never delayed."""
+    acks = _Acks(40 * MS, keep_alive_ns=25 * MS)
+
+    def prompt(number: int, at_ms: int) -> bool:
+        """Whether this segment, in order, is acknowledged as it arrives."""
+        before = len(acks.all)
+        acks.receiver.segment(Data(number, number + 1, at_ms), at_ms * MS)
+        return len(acks.all) > before
+
+    assert all(prompt(number, 1 + number) for number in range(24))
+    assert [prompt(number, 1 + number) for number in range(24, 28)] == [False, True, False, True]
+    acks.receiver.segment(Data(3, 4, 29), 29 * MS)
+    assert all(prompt(number, 2 + number) for number in range(28, 48))  # 30 … 49 ms
+    assert [prompt(number, 2 + number) for number in range(48, 52)] == [False, True, False, True]
+
+
+def test_the_round_trip_of_rack_is_that_of_the_last_segment_acknowledged_in_order() -> None:
+    """Sent at 0, 10 and 20 ms; at 23 ms the first is acknowledged, late, and the third reported beyond the second. RACK
+    then allows the second the round trip of the first, 23 ms, of which 13 are over; with the first acknowledged before,
+    3 ms, which are over."""
+
+    def left_ms(first_ack_ms: int) -> tuple[float, int]:
+        board = Scoreboard(1448)
+        for number, at_ms in enumerate((0, 10, 20)):
+            board.queue.append(Segment(number, number + 1, at_ms * MS))
+        board.next = 3
+        if first_ack_ms < 23:
+            board.una = 1
+            board.clean(Ack(1, 0, ()), 0, 3 * MS, first_ack_ms * MS, News())
+        ack = Ack(1, 0, ((2, 3),))
+        board.una = 1
+        board.take_sacks(ack, 0, 3 * MS, 23 * MS, News())
+        board.clean(ack, 0, 3 * MS, 23 * MS, News())
+        wait_ns = board.detect(0, 23 * MS)[1]
+        return wait_ns / MS, board.lost
+
+    assert left_ms(23) == (10, 0)
+    assert left_ms(3) == (0, 1)

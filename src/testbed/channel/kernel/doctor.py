@@ -55,6 +55,11 @@ def examine() -> list[Finding]:
     ]
 
 
+def can_make_hosts() -> Finding:
+    """Whether two hosts can be joined through TUN devices."""
+    return tun_backend(_trial("root" if privileged() else "user"))
+
+
 def relay(problem: str | None) -> Finding:
     if problem is None:
         return Finding("relay", True, "sockets on loopback; needs no rights")

@@ -95,6 +95,8 @@ def _answer(control: Control, hosts: Hosts) -> bool:
     try:
         if "change" in asked:
             hosts.change(asked["change"], asked["impairments"])
+        if "begin" in asked:
+            hosts.begin(asked["begin"])
         answer: dict[str, object] = {"books": hosts.books()}
     except TestbedError as error:
         answer = {"wrong": str(error)}

@@ -145,11 +145,19 @@ class Hosts:
 
     def change(self, direction: Literal["forward", "backward"], impairments: Impairments) -> None:
         """Other parameters from now on; chains, draws and what is in flight go on. Only through TUN devices."""
+        self._may_change()
+        self._books = self._ask({"change": direction, "impairments": _dumped(impairments)})["books"]
+
+    def begin(self, forward: Impairments, backward: Impairments) -> None:
+        """These impairments from the next packet on, which is number 0, with empty books: once nothing is in flight."""
+        self._may_change()
+        self._books = self._ask({"begin": {"forward": _dumped(forward), "backward": _dumped(backward)}})["books"]
+
+    def _may_change(self) -> None:
         if self._plan["backend"] == "netem":
             raise UsageError("backend netem: its parameters cannot be changed while it runs; allowed: backend tun")
         if self._control is None:
             raise UsageError("the hosts are closed; allowed: a change while they run")
-        self._books = self._ask({"change": direction, "impairments": _dumped(impairments)})["books"]
 
     @property
     def entrances(self) -> dict[str, str]:

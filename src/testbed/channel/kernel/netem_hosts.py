@@ -69,6 +69,9 @@ class NetemHosts:
     def change(self, direction: str, impairments: dict[str, Any]) -> None:
         raise NotImplementedError  # refused by the owner
 
+    def begin(self, impairments: dict[str, Any]) -> None:
+        raise NotImplementedError  # refused by the owner
+
     def books(self) -> dict[str, dict[str, int]]:
         """Of each way, from the counters of devices and queues; netem does not tell which packets it corrupted."""
         with inside(self._middle):

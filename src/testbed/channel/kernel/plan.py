@@ -33,6 +33,9 @@ class Hosts(Protocol):
     def change(self, direction: str, impairments: dict[str, Any]) -> None:
         """Other parameters from now on."""
 
+    def begin(self, impairments: dict[str, Any]) -> None:
+        """These, by direction, from the next packet on, which is number 0, with empty books."""
+
     def books(self) -> dict[str, dict[str, int]]:
         """By direction, what became of the packets."""
 

@@ -24,6 +24,7 @@ class TunHosts:
         second, self._b = _host(plan, 1)
         self.networks = (first, second)
         self._ways: dict[str, Way] = {}
+        self._plan = plan
         self._clock: Callable[[], int] = lambda: 0
 
     def prepare(self, plan: Plan) -> None:
@@ -47,6 +48,16 @@ class TunHosts:
         from testbed.scenario.links import Impairments
 
         self._ways[direction].pipeline.change(Impairments.model_validate(impairments))
+
+    def begin(self, impairments: dict[str, Any]) -> None:
+        from testbed.channel.pipeline import Pipeline
+        from testbed.scenario.links import Impairments
+
+        for direction, settings in impairments.items():
+            component = self._plan[direction]["component"]
+            self._ways[direction].pipeline = Pipeline(
+                Impairments.model_validate(settings), self._plan["seed"], component
+            )
 
     def books(self) -> dict[str, dict[str, int]]:
         """Of each way. overrun: packets that the sender's own queue had no room for, and that were never sent."""

@@ -47,13 +47,17 @@ class SocketLink:
     ) -> None:
         for settings in impairments:
             self.check(settings)
+        self._seed, self._components = seed, dict(zip(DIRECTIONS, components, strict=True))
         self._pipelines = {
-            direction: Pipeline(settings, seed, component)
-            for direction, settings, component in zip(DIRECTIONS, impairments, components, strict=True)
+            direction: self._pipeline(direction, settings)
+            for direction, settings in zip(DIRECTIONS, impairments, strict=True)
         }
         self._traces = {direction: TraceWriter(path) for direction, path in (traces or {}).items()}
         self._loop = Loop(name, self._due)
         self._closed = False
+
+    def _pipeline(self, direction: Direction, settings: Impairments) -> Pipeline:
+        return Pipeline(settings, self._seed, self._components[direction])
 
     @staticmethod
     def check(settings: Impairments) -> None:

@@ -35,6 +35,7 @@ class UdpRelay(SocketLink):
 
     The packets of a direction are numbered over all clients. Beyond ``clients_max`` clients a new one takes the place
     of the one that was silent longest, if that was ``idle_ns`` or longer; else its packets are refused and counted.
+    checksummed: a corrupted packet is dropped, as the UDP of its receiver would, instead of handed on.
 
     Raises UsageError where the address cannot be had.
     """
@@ -50,6 +51,7 @@ class UdpRelay(SocketLink):
         listen: tuple[str, int] = ("127.0.0.1", 0),
         clients_max: int = 64,
         idle_ns: int = 60_000_000_000,
+        checksummed: bool = False,
         traces: dict[Direction, Path] | None = None,
     ) -> None:
         self._family, self._target = Endpoint("udp", *target).resolve()
@@ -66,9 +68,31 @@ class UdpRelay(SocketLink):
         except BaseException:
             self._listener.close()
             raise
-        self._ways = {way: Way(self._pipelines[way], self._traces.get(way), _HELD_MAX) for way in DIRECTIONS}
+        self._ways = {
+            way: Way(self._pipelines[way], self._traces.get(way), _HELD_MAX, checksummed) for way in DIRECTIONS
+        }
         self._forward, self._backward = self._ways["forward"], self._ways["backward"]
         self._loop.watch(self._listener.fileno(), self._from_clients)
+
+    def limit_clients(self, clients_max: int) -> None:
+        """Let so many in from now on; those that are in stay. From any thread."""
+
+        def limit() -> None:
+            self._clients_max = clients_max
+
+        self._loop.call(limit)
+
+    def begin(self, forward: Impairments, backward: Impairments) -> None:
+        """These impairments from the next packet on, which is number 0, with empty books. From any thread.
+
+        What was in flight before is counted as delivered when it is: call it when nothing is.
+        """
+
+        def begin() -> None:
+            for direction, settings in zip(DIRECTIONS, (forward, backward), strict=True):
+                self._pipelines[direction] = self._ways[direction].pipeline = self._pipeline(direction, settings)
+
+        self._loop.call(begin)
 
     def _from_clients(self, _: int) -> None:
         receive, clients, loop, way = self._listener.recvfrom, self._clients, self._loop, self._forward

@@ -19,15 +19,16 @@ class Way:
     """Takes packets, and hands each to its socket when the pipeline says, in the books of the pipeline.
 
     Causes of drops beyond those of the pipeline: "overflow", when more is on its way than ``held_max`` bytes;
-    "socket", when the socket refuses the packet.
+    "socket", when the socket refuses the packet; "corrupt", where checksums are looked at.
     unreachable: how often the system reported that nobody listened. overdue: copies handed on more than 1 ms late.
     """
 
-    def __init__(self, pipeline: Pipeline, trace: TraceWriter | None, held_max: int) -> None:
+    def __init__(self, pipeline: Pipeline, trace: TraceWriter | None, held_max: int, checksummed: bool = False) -> None:
         self.pipeline, self.trace = pipeline, trace
         self.unreachable = self.overdue = 0
         self._schedule: Schedule[tuple[int, int, bytes, Send]] = Schedule()
         self._held, self._held_max = 0, held_max
+        self._checksummed = checksummed
 
     @property
     def held_packets(self) -> int:
@@ -41,6 +42,9 @@ class Way:
         if not copies and self.trace is not None:
             self.trace.lost(number, now_ns)
         for copy in copies:
+            if self._checksummed and copy.flip is not None:
+                self._drop("corrupt", number, now_ns)
+                continue
             content = data if copy.flip is None else flipped(data, copy.flip)
             at_ns, next_ns = copy.at_ns, self._schedule.next_ns
             if at_ns <= now_ns and (next_ns is None or at_ns < next_ns):

@@ -44,6 +44,7 @@ class TcpCarrier:
         self._framing, self._buffer = options.framing_bytes, options.buffer_bytes
         self._blocks, self._waiting_max = options.when_full == "block", options.waiting_max
         self._delayed_ack_ns = parse_duration(options.delayed_ack, zero=True)
+        self._keep_alive_ns = parse_duration(options.keep_alive, zero=True)
         self._blocked_limit_ns = parse_duration(options.blocked_limit)
         self._lease_ns = parse_duration(options.lease)
         self._packets: list[tuple[int, int, int, int, Data | Ack | int]] = []  # time, order, connection, kind, content
@@ -232,7 +233,7 @@ class TcpCarrier:
         if round_trip_ns is not None:
             self._sender.trips.see_least(round_trip_ns)
             self._sender.trips.sample(round_trip_ns, 0, 0)
-        self._receiver = Receiver(self._delayed_ack_ns, self._acknowledge)
+        self._receiver = Receiver(self._delayed_ack_ns, self._acknowledge, self._keep_alive_ns)
         self._ends: deque[tuple[int, int]] = deque()  # end in the stream, number; not delivered
         self._waiting: deque[tuple[int, int]] = deque()  # number, size; no room for them yet
         self._progress_ns = self._blocked_ns = 0

@@ -16,12 +16,20 @@ class Receiver:
     A segment out of order, one that came before and one that fills a gap are acknowledged at once (RFC 5681, 4.2).
     Others, with ``delay_ns`` = 0, too: Linux does that when the application reads each small segment at once and sends
     nothing back. Else every second one is, or what is there when ``delay_ns`` is over.
+
+    With ``keep_alive_ns`` they are delayed only as long as Linux takes the connection for a conversation: it does when
+    data is sent back, which happens so often, and no longer does when a segment came that had been acknowledged before.
+
+    The time stamp that is echoed is the latest of a segment that touches the last acknowledgement (RFC 7323, 4.3). One
+    that ends before it is refused unread (RFC 9293, 3.10.7.4): its acknowledgement has an older stamp, and the sender
+    measures a round trip as long as the silence before it.
     """
 
-    def __init__(self, delay_ns: int, acknowledge: Callable[[Ack, int], None]) -> None:
+    def __init__(self, delay_ns: int, acknowledge: Callable[[Ack, int], None], keep_alive_ns: int = 0) -> None:
         self.expected = 0
         self.deadline_ns: int | None = None
-        self._delay_ns, self._send = delay_ns, acknowledge
+        self._delay_ns, self._keep_alive_ns, self._send = delay_ns, keep_alive_ns, acknowledge
+        self._talks_ns: int | None = None  # when data is sent back next; until then nothing is delayed
         self._ranges: list[tuple[int, int]] = []  # beyond `expected`, the one that changed last first
         self._told = 0
         self._stamp = 0
@@ -32,14 +40,14 @@ class Receiver:
         """Take in a segment; True if more of the stream is in order now."""
         start, end, stamp = data
         expected = self.expected
-        if start <= self._told and stamp > self._stamp:
+        if start <= self._told <= end and stamp > self._stamp:
             self._stamp = stamp
         duplicate: tuple[int, int] | None = None
         if start > expected:
             self._acknowledge(now_ns, self._insert(start, end))
             return False
         if end <= expected:
-            self._quick = _QUICK
+            self._quick, self._talks_ns = _QUICK, None
             self._acknowledge(now_ns, (start, end))
             return False
         if start < expected:
@@ -60,7 +68,9 @@ class Receiver:
 
     def _delay(self, now_ns: int) -> None:
         self._waiting += 1
-        if self._quick > 0 or self._waiting >= 2:
+        if self._keep_alive_ns and self._talks_ns is None:
+            self._talks_ns = (now_ns // self._keep_alive_ns + 1) * self._keep_alive_ns
+        if self._quick > 0 or self._waiting >= 2 or now_ns < (self._talks_ns or 0):
             self._quick -= 1
             self._acknowledge(now_ns, None)
         else:

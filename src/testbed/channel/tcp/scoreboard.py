@@ -151,15 +151,18 @@ class Scoreboard:
             self._saw_reordering(reorder, top)
 
     def _latest(self, segment: Segment, least_ns: int | None, now_ns: int) -> None:
-        """RACK's latest delivery (RFC 8985, step 2): of the segments delivered, the one that was sent last."""
+        """RACK's latest delivery (RFC 8985, step 2): of the segments delivered, the one that was sent last.
+
+        The round trip is, as in Linux, that of the segment looked at last: those acknowledged in order come after those
+        reported beyond a gap. So one whose acknowledgement was delayed makes the sender wait longer for what is lost.
+        """
         sent_ns = segment.sent_ns
-        if sent_ns < self._latest_ns or (sent_ns == self._latest_ns and segment.end <= self._latest_end):
-            return
         rtt_ns = now_ns - sent_ns
         if segment.ever and (least_ns is None or rtt_ns < least_ns):
             return  # it may be an earlier transmission that arrived
-        self._latest_ns, self._latest_end, self._rtt_ns = sent_ns, segment.end, rtt_ns
-        self.advanced = True
+        self._rtt_ns, self.advanced = rtt_ns, True
+        if (sent_ns, segment.end) > (self._latest_ns, self._latest_end):
+            self._latest_ns, self._latest_end = sent_ns, segment.end
 
     def _saw_reordering(self, low: int, top: int) -> None:
         if low >= top:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from testbed.orchestrator.report.derived import relative_excess
 from testbed.orchestrator.report.link_model import Expected
-from testbed.orchestrator.summary import Series, Summary
+from testbed.orchestrator.summary import CostFigures, Series, Summary
 
 
 def covariance_csv(summary: Summary) -> str:
@@ -54,6 +54,12 @@ def excess_csv(summary: Summary) -> str:
         columns[f"relative_excess_mean:{name}"] = tuple(_finite(mean.tolist()))
         columns[f"relative_excess_stderr:{name}"] = tuple(_finite(stderr.tolist()))
     return _along_k(summary.completed_steps, columns)
+
+
+def cost_csv(cost: CostFigures, completed_steps: int) -> str:
+    """Columns k; the cost of a step, its two terms, and their standard errors."""
+    names = [f"{figure}_{kind}" for figure in ("step", "state", "input") for kind in ("mean", "stderr")]
+    return _along_k(completed_steps, {name: getattr(cost, name) for name in names})
 
 
 def links_csv(summary: Summary, expected: Mapping[str, Expected]) -> str:

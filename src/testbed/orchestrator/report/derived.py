@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from testbed.orchestrator.lane_windows import first_settled
 from testbed.orchestrator.summary import Z_95, EstimatorFigures, Series, Summary
 
 Vector = NDArray[np.float64]
@@ -49,7 +50,7 @@ def settled(figures: EstimatorFigures, completed_steps: int) -> Settled | None:
     last = steps_run(figures, completed_steps)
     if last < figures.since:
         return None
-    first = last - max(1, (last - figures.since + 1) // 4) + 1
+    first = figures.since - 1 + first_settled(last - figures.since + 1)
 
     def quarter(series: Series) -> float | None:
         return mean(as_vector(series)[first - 1 : last])

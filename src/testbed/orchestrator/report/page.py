@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 
 from testbed.orchestrator.report import csv_data, svg
 from testbed.orchestrator.report.derived import common_band, settled
-from testbed.orchestrator.report.figures import axes, covariance, excess, links, nees
+from testbed.orchestrator.report.figures import axes, cost, covariance, excess, links, nees
 from testbed.orchestrator.report.figures.ratio import ratios
 from testbed.orchestrator.report.html import ENVIRONMENT, PageFigure, page_figure
 from testbed.orchestrator.report.link_model import Expected, expected_links
-from testbed.orchestrator.summary import Summary
+from testbed.orchestrator.summary import CostFigures, Summary
 
 
 def report_html(summary: Summary, scenario_toml: str) -> str:
@@ -61,6 +61,13 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
             "Squared error less claimed covariance along the steps",
         ),
         (
+            "cost",
+            ran and summary.cost is not None,
+            lambda: cost.draw(_given(summary.cost), summary.completed_steps),
+            lambda: csv_data.cost_csv(_given(summary.cost), summary.completed_steps),
+            "Quadratic cost along the steps",
+        ),
+        (
             "links",
             any(link.sent for link in summary.links.values()),
             lambda: links.draw(summary, expected),
@@ -73,3 +80,8 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
         name: page_figure(number, name, draw, numbers(), label)
         for number, (name, _, draw, numbers, label) in enumerate(shown, start=1)
     }
+
+
+def _given(costs: CostFigures | None) -> CostFigures:
+    assert costs is not None
+    return costs
