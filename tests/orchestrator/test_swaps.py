@@ -583,3 +583,41 @@ def test_a_twin_is_of_the_new_kind_and_was_never_swapped(tmp_path: Path) -> None
     assert first.transient is not None
     assert (first.transient.twin, first.transient.last) == ("b", 11)
     assert (second.transient, third.transient) == (None, None)
+
+
+@pytest.mark.parametrize("lanes", [1, 4])
+def test_windows_of_lanes_that_begin_before_an_estimator_have_no_mean(lanes: int, tmp_path: Path) -> None:
+    specs = [{"name": "aoe", "acks": "none"}]
+    events = [{"at": 8, "action": "shadow", "estimator": "aoe", "name": "s", "to": {"kind": "aoe"}, "handover": "full"}]
+    seen: list[Conductor] = []
+
+    class Seen(Conductor):
+        def stop(self) -> None:
+            seen.append(self)
+            super().stop()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("testbed.orchestrator.run.Conductor", Seen)
+        run(scenario(estimators=specs, events=events, lanes=lanes), tmp_path)
+    figures = seen[0].collector.by_lane()
+    begins = np.array([0, *figures.ends[:-1]])
+    own, shadow = figures.figures["aoe"]["squared_error"], figures.figures["s"]["squared_error"]
+    assert own.shape == shadow.shape == (len(begins), lanes)
+    assert np.isnan(shadow[begins + 1 < 8]).all()
+    assert (begins + 1 >= 8).any()
+    np.testing.assert_array_equal(shadow[begins + 1 >= 8], own[begins + 1 >= 8])
+
+
+def test_the_statement_on_an_lqg_controller_knows_of_swaps() -> None:
+    from testbed.control.optimality import statement
+
+    weights = {"Qx": [[1.0, 0.0], [0.0, 1.0]], "Ru": [[1.0]]}
+    loop = {"kind": "lqg", **weights, "estimator": "kfio"}
+    for events, text in (
+        ([], "optimal: no controller"),
+        ([swap(9, "kfio", {"kind": "kfio"}, "full")], "optimal: no controller"),
+        ([swap(9, "kfio", {"kind": "kfio"})], "not optimal: kfio is swapped at step 9, and the new one does not know"),
+    ):
+        found = statement(scenario(input=loop, events=events))
+        assert found is not None
+        assert found.startswith(text)
