@@ -71,7 +71,12 @@ SCENARIO_TABLES = (
     ("UdpTransport", '`transport = { kind = "udp", … }`', ""),
     ("TcpTransport", '`transport = { kind = "tcp", … }`', ""),
     ("EstimatorSpec", "`[[estimators]]`", ""),
-    ("LinkEvent", "`[[events]]`", ""),
+    ("LinkEvent", '`[[events]]`, `action = "set"`', ""),
+    ("SwapEvent", '`[[events]]`, `action = "swap"`', ""),
+    ("AddEvent", '`[[events]]`, `action = "add"`', ""),
+    ("ShadowEvent", '`[[events]]`, `action = "shadow"`', ""),
+    ("RemoveEvent", '`[[events]]`, `action = "remove"`', ""),
+    ("NewService", "`to = { … }`", ""),
     ("Clock", "`[clock]`", ""),
     ("Transport", "`[transport]`", ""),
     ("Tls", "`[transport.tls]`", ""),
@@ -85,11 +90,13 @@ SUMMARY_TABLES = (
     ("LinkFigures", "`links.NAME`", ""),
     ("Transitions", "`links.NAME.transitions`", ""),
     ("Happened", "`events[…]`", ""),
+    ("Transient", "`events[…].transient`", ""),
     ("Check", "`checks[…]`", ""),
     ("Timing", "`timing`", ""),
     ("RealTime", "`realtime`", "Only in real time; see [Real time](../explanation/real-time.md)."),
     ("Stage", "`realtime.stages.TOPIC`", ""),
     ("Quantiles", "`realtime.stages.TOPIC.published` and the like", ""),
+    ("Downtime", "`timing.swaps[…]`", ""),
 )
 COMMON_FIELDS = ("v", "type", "run", "source", "seq")
 MEANINGS = {
@@ -104,6 +111,7 @@ MEANINGS = {
     "delivered": "that arrived, a duplicate once",
     "dropped": "that were lost",
     "duplicated": "that arrived twice",
+    "estimator": "name of the estimator",
     "estimators": "figures by name of the estimator",
     "in_flight": "still on their way at the end",
     "kind": "which estimator it is",
@@ -300,6 +308,8 @@ def _type(field: Schema) -> str:
     """The type of a field in words."""
     if "anyOf" in field:
         return " or ".join(dict.fromkeys(_type(option) for option in field["anyOf"] if option.get("type") != "null"))
+    if any(option.get("type") == "string" for option in field.get("oneOf", ())):
+        return "table or text"
     if "$ref" in field or "oneOf" in field:
         return "table"
     if "const" in field:
@@ -389,11 +399,18 @@ def _commands(group: typer.Typer, prefix: str) -> Iterable[str]:
         yield _command(f"{prefix} {command.name or callback.__name__}", callback)
     for sub in group.registered_groups:
         assert sub.typer_instance is not None
-        yield from _commands(sub.typer_instance, f"{prefix} {sub.name}")
+        outer = sub.typer_instance.registered_callback
+        given = [text for text, _, _ in _parameters(outer.callback)[0]] if outer and outer.callback else []
+        yield from _commands(sub.typer_instance, " ".join([prefix, str(sub.name), *given]))
 
 
-def _command(name: str, callback: Callable[..., Any]) -> str:
-    arguments, options = [], []
+Parameters = list[tuple[str, inspect.Parameter, Any]]
+
+
+def _parameters(callback: Callable[..., Any]) -> tuple[Parameters, Parameters]:
+    """The arguments and the options of a command, each as it is written."""
+    arguments: Parameters = []
+    options: Parameters = []
     hints = get_type_hints(callback, include_extras=True)
     for parameter in inspect.signature(callback).parameters.values():
         hint = hints[parameter.name]
@@ -404,6 +421,11 @@ def _command(name: str, callback: Callable[..., Any]) -> str:
             declared = [text for text in (info.default, *(info.param_decls or ())) if isinstance(text, str)]
             spelt = declared or ["--" + parameter.name.replace("_", "-")]
             options.append((f"{', '.join(spelt)} {info.metavar or ''}".strip(), parameter, info))
+    return arguments, options
+
+
+def _command(name: str, callback: Callable[..., Any]) -> str:
+    arguments, options = _parameters(callback)
     usage = " ".join([name, *(text for text, _, _ in arguments), "[OPTIONS]"])
     parts = [f"## {name}", f"```text\n{usage}\n```", (inspect.getdoc(callback) or "").strip()]
     rows = [(f"`{text}`", _needed(parameter), info.help or "") for text, parameter, info in (*arguments, *options)]

@@ -16,6 +16,7 @@ from estimator.reference.cases import Trial, check, random_system, random_trial
 from estimator.reference.drive import model_of
 from testbed.cli.main import run_command
 from testbed.errors import UsageError
+from testbed.estimator.handover import give, start
 from testbed.estimator.model import Ack, Estimate
 from testbed.estimator.packets import PacketLine, read_packets, replay
 from testbed.estimator.refilter import LateObservation, Refilter
@@ -60,9 +61,15 @@ class Delays:
             estimate: Estimate = estimator.step(self.trial.u[k - 1], self.trial.y[k - 1], arrived, acks)
         return estimate
 
-    def as_it_comes(self, depth: int) -> tuple[list[Estimate], Refilter]:
+    def as_it_comes(self, depth: int, handed: tuple[int, ...] = ()) -> tuple[list[Estimate], Refilter]:
+        """handed: steps after which another one goes on from the bytes that this one gives."""
         refilter, out = Refilter(self.fresh(), depth), []
+        latest = Estimate(*self.model.prior(LANES), LANES)
         for k in range(1, STEPS + 1):
+            if k - 1 in handed:
+                data = give(refilter, "full", step=k - 1, estimate=out[-1] if out else latest)
+                refilter = Refilter(self.fresh(), depth)
+                start(refilter, "full", data, model=self.model, lanes=LANES, step=k - 1)
             late = [
                 LateObservation(j, self.trial.y[j - 1], self.gamma(j) & (self.comes[j - 1] == k)) for j in range(1, k)
             ]
@@ -189,3 +196,59 @@ def test_the_command_uses_what_is_late(tmp_path: Path, capsys: pytest.CaptureFix
     unused = capsys.readouterr()
     assert "old_observations 1" in unused.err
     assert json.loads(used.out.splitlines()[-1])["P"] < json.loads(unused.out.splitlines()[-1])["P"]
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "ff", "oe"])
+@pytest.mark.parametrize("depth", [0, 3, 8])
+def test_a_full_hand_over_takes_the_memory_with_it(kind: str, depth: int) -> None:
+    delays = Delays(kind, seed=5, longest=4)
+    whole, one = delays.as_it_comes(depth)
+    for handed in (tuple(range(STEPS)), (4,), (0, 9)):
+        again, other = delays.as_it_comes(depth, handed)
+        assert one.counters == other.counters
+        for before, after in zip(whole, again, strict=True):
+            np.testing.assert_array_equal(before.x_hat, after.x_hat)
+            np.testing.assert_array_equal(before.P, after.P)
+    assert one.counters.get("refiltered", 0) > 0 or not depth
+
+
+def test_a_start_from_moments_remembers_nothing_before() -> None:
+    delays = Delays("aoe", seed=3, longest=0)
+    out, old = delays.as_it_comes(4)
+    data = give(old, "moments", step=STEPS, estimate=out[-1])
+    new = Refilter(delays.fresh(), 4)
+    start(new, "moments", data, model=delays.model, lanes=LANES, step=STEPS)
+    late = [LateObservation(STEPS, delays.trial.y[-1], np.array([True, False, True]))]
+    nothing, u = np.zeros(LANES, dtype=bool), delays.trial.u[0]
+    found = new.step(u, delays.trial.y[0], nothing, (), late)
+    alone = delays.fresh()
+    alone.start_from(STEPS, out[-1].x_hat, out[-1].P)
+    np.testing.assert_array_equal(found.P, alone.step(u, delays.trial.y[0], nothing).P)
+    assert new.counters["old_observations"] == 2
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda memory: memory.pop("u"),
+        lambda memory: memory.update(steps=memory["steps"] + 1),
+        lambda memory: memory.update(ack_steps=memory["ack_steps"] + 100),
+        lambda memory: memory.update(checkpoints=memory["checkpoints"] + 50),
+        lambda memory: memory.update(arrived=memory["arrived"][:1]),
+    ],
+)
+def test_a_memory_that_does_not_fit_is_refused(spoil: Any) -> None:
+    delays = Delays("aoe", seed=3, longest=4)
+    _, old = delays.as_it_comes(4)
+    memory = old.memory()
+    spoil(memory)
+    with pytest.raises(UsageError, match="memory of late packets: "):
+        Refilter(delays.fresh(), 4).remember(STEPS, memory)
+
+
+def test_a_hand_over_in_another_form_is_refused() -> None:
+    delays = Delays("aoe", seed=3, longest=4)
+    out, old = delays.as_it_comes(4)
+    data = give(old, "moments", step=STEPS, estimate=out[-1])
+    with pytest.raises(UsageError, match="snapshot: in the moments form; expected full"):
+        start(Refilter(delays.fresh(), 4), "full", data, model=delays.model, lanes=LANES, step=STEPS)

@@ -182,7 +182,7 @@ def test_settings_on_the_command_line() -> None:
         (event(1, "control"), "events[0].set: got a table; allowed: a table with keys of the link"),
         (event(1, "control", los={}), "events[0].set: los: cannot be set while a run goes; allowed: loss, clock"),
         (event(1, "contro", loss="none"), "events[0].link: got 'contro'; allowed: control, observation, ack; did you"),
-        ({**event(1, "control", loss="none"), "action": "sett"}, "events[0].action: got 'sett'; allowed: set; did you"),
+        ({**event(1, "control", loss="none"), "action": "sett"}, "events[0].action: got 'sett'; allowed: set, swap, "),
     ],
 )
 def test_wrong_events_are_one_line(wrong: dict[str, Any], problem: str) -> None:

@@ -14,7 +14,7 @@ from testbed.wire.codec import Decoder, PacketEncoder, Sizes, encode
 from testbed.wire.keys import Keys
 from testbed.wire.memory_bus import MemoryNetwork
 from testbed.wire.messages import ClockMessage, Command, Control, Observation, Status
-from testbed.wire.node import ORCHESTRATOR, Node
+from testbed.wire.node import ORCHESTRATOR, Gate, Node
 
 RUN = "run0testrun1"
 SIZES = Sizes(n=2, p=1, q=1, lanes=4, steps=10, lanes_per_packet=2)
@@ -248,3 +248,45 @@ def test_the_report_says_what_was_refused() -> None:
     first, second = (Decoder(Status, RUN, SIZES).decode(payload)[0] for payload in reports)
     assert (first.seq, first.state, first.counters, first.rejected) == (0, "stopped", {"late_acks": 3}, {"format": 1})
     assert (second.seq, second.state, len(second.detail)) == (1, "failed", 2000)
+
+
+def test_who_joins_at_a_step_passes_over_what_was_before() -> None:
+    gate = Gate(None)
+    bench = Bench(gate=gate)
+    assert not bench.send(packet(0, 1))
+    assert not bench.send(packet(5, 3, lane=2))
+    gate.passed_over = 3
+    assert not bench.send(packet(5, 3, lane=2))
+    assert not bench.send(packet(6, 4, lane=2))
+    assert not bench.send(packet(7, 5, lane=2))
+    assert not bench.send(packet(8, 4))
+    assert bench.taken == [(6, 4, 2), (7, 5, 2), (8, 4, 0)]
+    assert bench.send(packet(9, 3)) == {"order": 1}
+    assert bench.send(packet(10, 5)) == {"sequence": 1}
+
+
+@pytest.mark.parametrize("first", [packet(7, 4), packet(5, 4), packet(6, 5), packet(6, 4, source="plant")])
+def test_who_joins_knows_which_packet_must_come_first(first: bytes) -> None:
+    bench = Bench(gate=Gate(3))
+    assert sum(bench.send(first).values()) == 1
+    assert not bench.send(packet(6, 4))
+    assert bench.taken == [(6, 4, 0)]
+
+
+def test_numbers_go_on_from_one_sender_to_the_next() -> None:
+    network, heard = MemoryNetwork(), []
+    key = KEYS.delivered("observation")
+    network.bus().subscribe(key, lambda _, payload: heard.append(Decoder(Observation, RUN, SIZES).decode(payload)[0]))
+    gate, late = Gate(0), Gate(None)
+    arrays = {"y": np.zeros((2, 1)), "mask": np.ones(2, dtype=np.uint8)}
+    senders = [
+        Node(network.bus(), RUN, name, SIZES).sender(key, Observation, gate=g)
+        for name, g in zip("ab", (gate, late), strict=True)
+    ]
+    for step, lane in ((1, 0), (1, 2), (2, 2), (2, 0)):
+        senders[0](step, lane, 2, arrays)
+    late.passed_over = 2
+    for step, lane in ((3, 2), (3, 0)):
+        senders[1](step, lane, 2, arrays)
+    network.run(lambda: False)
+    assert [(packet.seq, packet.source) for packet in heard] == [(i, "a" if i < 4 else "b") for i in range(6)]

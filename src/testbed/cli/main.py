@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from testbed import __version__
-from testbed.cli import analyze, compare, conformance, link, replay, run, schema
+from testbed.cli import analyze, compare, conformance, ctl, link, replay, run, schema
 from testbed.errors import TestbedError
 
 app = typer.Typer(
@@ -28,6 +28,7 @@ app.command("conformance")(conformance.conformance)
 app.command("replay")(replay.replay)
 app.command("schema")(schema.schema)
 app.add_typer(link.app, name="link")
+app.add_typer(ctl.app, name="ctl")
 
 _CommandLineError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 """The base of what typer raises for a wrong command line; some versions of it carry their own copy of click."""

@@ -6,6 +6,7 @@ from testbed.estimator.buffers import acks_of
 from testbed.estimator.registry import model_of
 from testbed.estimator.service import spec_of
 from testbed.scenario import LqgInput, Scenario
+from testbed.scenario.services import Planned
 
 WITH_ACKS = frozenset({"kfio", "oe", "oe-exact", "aoe", "gpb", "gpb1", "gpb2", "imm", "lmmse", "ff", "kf"})
 """Estimators that with every ACK in time are one and the same: the conditional mean."""
@@ -46,6 +47,13 @@ def shortcomings(scenario: Scenario, source: LqgInput) -> list[str]:
         out.append("the input has limits")
     if scenario.uncertainty is not None:
         out.append("the plant departs from its model")
-    if any(event.link == "control" for event in scenario.events):
+    unlike = [plan.step for plan in scenario.swaps if _replaces(plan, spec.name) and plan.handover != "full"]
+    if unlike:
+        out.append(f"{spec.name} is swapped at step {unlike[0]}, and the new one does not know all that came before")
+    if scenario.changes_of("control"):
         out.append("the losses of control change, and the gain is for those at the beginning")
     return out
+
+
+def _replaces(plan: Planned, name: str) -> bool:
+    return plan.event.action == "swap" and plan.event.estimator == name

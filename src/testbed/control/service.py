@@ -29,6 +29,11 @@ def build(node: Node, setup: Setup) -> OpenLoopService | ClosedLoopService:
     return (PacedOpenLoop if setup.real else OpenLoopService)(node, setup)
 
 
+def _is_estimator(packet: EstimateMessage) -> bool:
+    """Which of them serves the name may change; that there is one for each step is checked by the numbers."""
+    return packet.source.startswith("estimator.")
+
+
 class OpenLoopService:
     """Streams u_0, u_1, … up to what the clock grants."""
 
@@ -76,7 +81,7 @@ class ClosedLoopService:
 
     def _listen(self, node: Node, name: str) -> None:
         """Follow the estimates of an estimator: the one place that says whose they are."""
-        node.on(node.keys.estimate(name), EstimateMessage, f"estimator.{name}", self._follow)
+        node.on(node.keys.estimate(name), EstimateMessage, _is_estimator, self._follow)
 
     def _follow(self, packet: EstimateMessage, arrays: dict[str, NDArray[Any]]) -> None:
         if packet.step < self._steps:

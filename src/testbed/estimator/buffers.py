@@ -24,5 +24,6 @@ def buffer_of(scenario: Scenario, spec: EstimatorSpec) -> int:
 
 def largest_buffer(scenario: Scenario) -> int:
     """That of the estimator that goes back farthest; without estimators, of one whose table says nothing."""
-    specs = scenario.estimators or (EstimatorSpec(name="any"),)
+    later = [plan.spec for plan in scenario.swaps if plan.spec is not None]
+    specs = [*scenario.estimators, *later] or [EstimatorSpec(name="any")]
     return max(buffer_of(scenario, spec) for spec in specs)

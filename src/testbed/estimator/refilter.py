@@ -7,7 +7,7 @@ remembered for ``depth`` steps; what is older is counted and not used. The work 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,6 +63,71 @@ class Refilter:
     def counters(self) -> dict[str, int]:
         return {**self.estimator.counters, **self._own}
 
+    def begin_at(self, step: int) -> None:
+        """Go on from the estimator as it is now, after ``step`` steps; nothing before is remembered."""
+        self._k, self._inputs, self._checkpoints, self._own = step, {}, {}, {}
+        self._checkpoint()
+
+    def memory(self) -> dict[str, NDArray[Any]]:
+        """What is remembered, as arrays: counters, inputs, ACKs, and the states to go back to."""
+        counters = {f"counter.{name}": np.array(count, dtype=np.int64) for name, count in self._own.items()}
+        if not self._depth:
+            return counters
+        steps = list(self._inputs)
+        known = [self._inputs[step] for step in steps]
+        acks = [(step, ack) for step, kept in zip(steps, known, strict=True) for ack in kept.acks]
+        out: dict[str, NDArray[Any]] = {**counters, "steps": np.array(steps, dtype=np.int64)}
+        if steps:
+            out |= {"u": np.array([k.u for k in known]), "y": np.array([k.y for k in known])}
+            out["arrived"] = np.array([k.arrived for k in known], dtype=np.uint8)
+        if acks:
+            out["ack_steps"] = np.array([step for step, _ in acks], dtype=np.int64)
+            out["ack_of"] = np.array([ack.j for _, ack in acks], dtype=np.int64)
+            out["ack_nu"] = np.array([ack.nu for _, ack in acks], dtype=np.uint8)
+            out["ack_known"] = np.array([ack.known for _, ack in acks], dtype=np.uint8)
+        out["checkpoints"] = np.array(list(self._checkpoints), dtype=np.int64)
+        for i, (state, counts) in enumerate(self._checkpoints.values()):
+            out |= {f"{i}.state.{name}": array for name, array in state.items()}
+            out |= {f"{i}.counter.{name}": np.array(count, dtype=np.int64) for name, count in counts.items()}
+        return out
+
+    def remember(self, step: int, memory: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from the estimator as it is now, after ``step`` steps, with the ``memory`` of another one like it.
+
+        Raises UsageError where it is none.
+        """
+        self.begin_at(step)
+        counter = "counter."
+        self._own = {n.removeprefix(counter): int(count) for n, count in memory.items() if n.startswith(counter)}
+        if not self._depth or "steps" not in memory:
+            return
+        try:
+            self._recall(memory)
+        except (KeyError, IndexError, ValueError, TypeError) as error:
+            raise UsageError(f"memory of late packets: {type(error).__name__}: {error}") from None
+        self._forget()
+
+    def _recall(self, memory: Mapping[str, NDArray[Any]]) -> None:
+        steps = memory["steps"].tolist()
+        for i, step in enumerate(steps):
+            arrived = np.array(memory["arrived"][i], dtype=np.bool_)
+            self._inputs[step] = _Inputs(np.array(memory["u"][i]), np.array(memory["y"][i]), arrived, [])
+        if "ack_steps" in memory:
+            for i, step in enumerate(memory["ack_steps"].tolist()):
+                ack = Ack(int(memory["ack_of"][i]), np.array(memory["ack_nu"][i]), np.array(memory["ack_known"][i]))
+                self._inputs[step].acks.append(ack)
+        kept = {}
+        for i, step in enumerate(memory["checkpoints"].tolist()):
+            state, counts = f"{i}.state.", f"{i}.counter."
+            kept[step] = (
+                {name.removeprefix(state): array for name, array in memory.items() if name.startswith(state)},
+                {name.removeprefix(counts): int(c) for name, c in memory.items() if name.startswith(counts)},
+            )
+        if kept:
+            self._checkpoints = kept
+        if self._inputs and (max(self._inputs) != self._k or min(self._checkpoints) >= min(self._inputs)):
+            raise ValueError("its steps do not fit together")
+
     def step(
         self,
         u: Floats,
@@ -91,7 +156,7 @@ class Refilter:
         return estimate
 
     def _remembered(self, step: int) -> bool:
-        return max(1, self._k + 1 - self._depth) <= step <= self._k
+        return max(1, self._k + 1 - self._depth) <= step <= self._k and step in self._inputs
 
     def _observe(self, late: LateObservation) -> tuple[int, NDArray[np.bool_]]:
         """Note a late observation; the step from which on it matters, and the lanes."""
@@ -152,7 +217,8 @@ class Refilter:
 
     def _forget(self) -> None:
         """Keep the last checkpoint from which every remembered step can be run again, and what came after it."""
-        oldest = max(k for k in self._checkpoints if k <= max(0, self._k - self._depth))
+        far = max(0, self._k - self._depth)
+        oldest = max((k for k in self._checkpoints if k <= far), default=min(self._checkpoints))
         self._checkpoints = {k: kept for k, kept in self._checkpoints.items() if k >= oldest}
         self._inputs = {k: kept for k, kept in self._inputs.items() if k > oldest}
 

@@ -8,16 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from testbed.errors import RunFailed
+from testbed.errors import RunFailed, UsageError
 from testbed.estimator.buffers import acks_of, buffer_of
-from testbed.estimator.model import Ack, Estimator, Restartable, seen
+from testbed.estimator.handover import give, start
+from testbed.estimator.model import Ack, Estimate, Estimator, Restartable, seen
 from testbed.estimator.refilter import LateObservation, Refilter
 from testbed.estimator.registry import create, model_of
 from testbed.numerics.lanes import Floats
 from testbed.scenario import EstimatorSpec, Scenario
 from testbed.wire.codec import all_finite
+from testbed.wire.handover import Order, answered
 from testbed.wire.messages import Acknowledgement, Control, EstimateMessage, Observation, Packet
-from testbed.wire.node import Node
+from testbed.wire.node import OPEN, Gate, Node
 from testbed.wire.setup import Setup
 
 
@@ -25,9 +27,9 @@ def role_of(name: str) -> str:
     return f"estimator.{name}"
 
 
-def builder(name: str) -> Any:
-    """What builds the service of the estimator of that name."""
-    return partial(EstimatorService, name=name)
+def builder(name: str, spec: EstimatorSpec | None = None) -> Any:
+    """What builds the service of the estimator of that name; ``spec``: of one that joins while the run goes."""
+    return partial(EstimatorService, name=name, spec=spec)
 
 
 def spec_of(scenario: Scenario, name: str) -> EstimatorSpec:
@@ -40,6 +42,9 @@ class _Block:
     def __init__(self, estimator: Estimator, buffer: int, lanes: int, parts: int) -> None:
         """buffer: steps that the estimator can go back, where it gives its state."""
         self.estimator, self.lanes = estimator, lanes
+        self.done = 0
+        """Steps of which the estimate was given."""
+        self.latest: Estimate | None = None
         self.refilter = Refilter(estimator, buffer if isinstance(estimator, Restartable) else 0)
         self._parts = parts
         self._waiting: dict[int, dict[str, dict[str, NDArray[Any]]]] = {}
@@ -54,15 +59,18 @@ class _Block:
 class EstimatorService:
     """Sees u as sent, what arrives of y, and what arrives of its ACKs; never the truth."""
 
-    def __init__(self, node: Node, setup: Setup, *, name: str) -> None:
+    def __init__(self, node: Node, setup: Setup, *, name: str, spec: EstimatorSpec | None = None) -> None:
+        """spec: of one that joins while the run goes: it waits until it is told from where it starts."""
         scenario = setup.scenario
-        spec = spec_of(scenario, name)
+        self._gate = Gate(None) if spec is not None else OPEN
+        if spec is None:
+            spec = spec_of(scenario, name)
         acks = acks_of(scenario, spec)
         model = model_of(scenario)
-        self._name, self._model = name, model
+        self._node, self._name, self._model = node, name, model
         self._noise = scenario.links.observation.on_loss == "noise"
         self._until = spec.until or scenario.steps
-        self._send = node.sender(node.keys.estimate(name), EstimateMessage)
+        self._send = node.sender(node.keys.estimate(name), EstimateMessage, gate=self._gate)
         self._blocks = {
             lane: _Block(
                 create(spec.kind, model, lanes=lanes, options=spec.options, lane=lane),
@@ -75,12 +83,14 @@ class EstimatorService:
         keys = node.keys
         take_u, take_y = partial(self._take, "u", 1), partial(self._take, "y", 0)
         take_ack = partial(self._take, "ack", 0)
-        node.on(keys.sent("control"), Control, "controller", take_u, needs=("u",))
-        node.on(keys.delivered("observation"), Observation, "link.observation", take_y, needs=("mask",))
+        gate = self._gate
+        node.on(keys.sent("control"), Control, "controller", take_u, needs=("u",), gate=gate)
+        node.on(keys.delivered("observation"), Observation, "link.observation", take_y, needs=("mask",), gate=gate)
         if acks == "perfect":
-            node.on(keys.sent("ack"), Acknowledgement, "plant", take_ack, needs=("nu",))
+            node.on(keys.sent("ack"), Acknowledgement, "plant", take_ack, needs=("nu",), gate=gate)
         elif acks == "link":
-            node.on(keys.delivered("ack"), Acknowledgement, "link.ack", take_ack, needs=("mask",))
+            node.on(keys.delivered("ack"), Acknowledgement, "link.ack", take_ack, needs=("mask",), gate=gate)
+        node.bus.answer(keys.handover(node.name), partial(answered, self._ordered))
 
     @property
     def counters(self) -> dict[str, int]:
@@ -90,9 +100,40 @@ class EstimatorService:
                 total[key] = total.get(key, 0) + value
         return total
 
+    def _ordered(self, order: Order, data: bytes) -> bytes:
+        """Do what the orchestrator asks at a step at which the clock stands still."""
+        step = order.step
+        if order.action in ("give", "take"):
+            block = self._blocks.get(order.lane)
+            if block is None:
+                raise UsageError(f"no block of lanes begins at {order.lane}")
+            return self._give(block, order) if order.action == "give" else self._start(block, order, data)
+        if any(block.done != min(step, self._until) for block in self._blocks.values()):
+            raise UsageError(f"asked after step {step}, and is at another")
+        if order.action == "leave":
+            self._node.stopped = True
+        elif order.name is not None:
+            key = self._node.keys.estimate(order.name)
+            self._name, self._send = order.name, self._node.sender(key, EstimateMessage, gate=Gate(step))
+        return b""
+
+    def _give(self, block: _Block, order: Order) -> bytes:
+        if block.done != order.step or order.form == "cold":
+            raise UsageError(f"asked for the state after step {order.step}, and is at {block.done}")
+        estimate = block.latest or Estimate(*self._model.prior(block.lanes), block.lanes)
+        return give(block.refilter, order.form, step=block.done, estimate=estimate)
+
+    def _start(self, block: _Block, order: Order, data: bytes) -> bytes:
+        if block.done or self._gate is OPEN:
+            raise UsageError("asked to start anew in the middle")
+        block.latest = start(block.refilter, order.form, data, model=self._model, lanes=block.lanes, step=order.step)
+        block.done = order.step
+        self._gate.passed_over = order.step
+        return b""
+
     def _take(self, part: str, ahead: int, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         step = packet.step + ahead
-        if step > self._until:
+        if step > self._until or self._node.stopped:
             return
         whole = self._blocks[packet.lane].join(step, part, arrays)
         if whole is not None:
@@ -113,6 +154,7 @@ class EstimatorService:
         arrays = {"x_hat": x_hat, "P": P}
         if estimate.error_bound is not None and estimate.error_bound_P is not None:
             arrays |= {"error_bound": estimate.error_bound, "error_bound_P": estimate.error_bound_P}
+        block.done, block.latest = step, estimate
         self._send(step, lane, block.lanes, arrays)
 
 

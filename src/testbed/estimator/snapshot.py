@@ -30,6 +30,7 @@ FORMAT = 1
 _MAGIC = b"NCSS"
 _DIGEST = 16
 _STATE, _COUNTER = "state.", "counter."
+MEMORY = "memory."
 _CODES: dict[str, np.dtype[Any]] = {"<f8": np.dtype("<f8"), "<i8": np.dtype("<i8"), "|u1": np.dtype("u1")}
 
 Form = Literal["full", "moments"]
@@ -57,7 +58,8 @@ class Snapshot:
     """After ``step`` steps of an estimator of ``kind``.
 
     version: the estimator's STATE_VERSION; arrays: x_hat (lanes, n) and P (lanes, n, n), and in the full form
-    ``state.NAME`` for each array of the state and ``counter.NAME`` for each counter.
+    ``state.NAME`` for each array of the state and ``counter.NAME`` for each counter, and where late packets are of use
+    ``memory.NAME`` for what is kept of the last steps.
     """
 
     form: Form
@@ -127,7 +129,8 @@ class Snapshot:
                 raise UsageError(f"snapshot: {name!r} is {array.dtype} {array.shape}; expected float64 {shape}")
         for name, array in self.arrays.items():
             counter = name.startswith(_COUNTER)
-            known = name in ("x_hat", "P") or (self.form == "full" and (counter or name.startswith(_STATE)))
+            own = counter or name.startswith((_STATE, MEMORY))
+            known = name in ("x_hat", "P") or (self.form == "full" and own)
             if not known or (counter and (array.dtype != np.int64 or array.shape != ())):
                 raise UsageError(f"snapshot: unexpected array {name!r} in the {self.form} form")
 

@@ -43,16 +43,13 @@ class Collector:
     def __init__(self, setup: Setup) -> None:
         self._setup, scenario = setup, setup.scenario
         self._blocks = [lane for lane, _ in setup.blocks]
+        self._first = {spec.name: 1 for spec in scenario.estimators}
         self._until = {spec.name: spec.until or scenario.steps for spec in scenario.estimators}
-        self._last_estimate = max(self._until.values(), default=0)
         self._words = {name: f"estimate of {name}" for name in self._until}
         self._with_bounds = scenario.bounds
         self._count = scenario.steps
         self._windows = window_ends(scenario.steps, scenario.lanes, self._until.values())
-        self.estimators = {
-            spec.name: Series(ERROR_FIGURES, scenario.lanes, kept=len(LANE_FIGURES), ends=self._windows)
-            for spec in scenario.estimators
-        }
+        self.estimators = {spec.name: self._new_series() for spec in scenario.estimators}
         self.bounds = Series(("lower", "upper", "upper_correlated"), scenario.lanes)
         self.completed = 0
         self.estimated = 0
@@ -65,17 +62,25 @@ class Collector:
             if scenario.cost
             else None
         )
-        self._series: list[Series | CostBook] = [*self.estimators.values(), self.bounds]
-        if self.cost is not None:
-            self._series.append(self.cost)
-        self._ends = sorted({*self._until.values(), scenario.steps})
-        self._parts = [self._parts_at(end) for end in self._ends]
+        self._plan()
         self._steps: dict[int, _Step] = {}
 
     def prepare(self) -> None:
         """What would hold up the first step: make it now."""
         for lanes in {lanes for _, lanes in self._setup.blocks}:
             prepare(self._setup.sizes.n, lanes)
+
+    def expect(self, name: str, first: int, last: int) -> None:
+        """Let the estimates of a name be due until step ``last``, and of a new one from ``first`` on.
+
+        What is granted already must not change by it.
+        """
+        if name not in self._until:
+            self._first[name], self._words[name] = first, f"estimate of {name}"
+            self.estimators[name] = series = self._new_series()
+            series.begin_at(first, self.completed)
+        self._until[name] = last
+        self._plan()
 
     @property
     def finished(self) -> bool:
@@ -122,26 +127,41 @@ class Collector:
 
     def awaiting(self) -> str:
         """What the oldest incomplete step still waits for."""
-        record = self._of(self.completed + 1)
+        record = self._steps.get(self.completed + 1) or self._record(self.completed + 1)
         awaited = {part for lane in self._blocks for part in record.parts if (lane, part) not in record.come}
         return f"step {self.completed + 1}: {', '.join(sorted(awaited))}"
 
     def _reduce(self, name: str, step: int, lane: int, x: Vector, x_hat: Vector, P: Matrix) -> None:
         self.estimators[name].add(step, lane, error_figures(x, x_hat, P))
 
+    def _new_series(self) -> Series:
+        return Series(ERROR_FIGURES, self._setup.scenario.lanes, kept=len(LANE_FIGURES), ends=self._windows)
+
     def _parts_at(self, step: int) -> tuple[frozenset[str], int]:
         """What a block of lanes has at a step, and how many of it are estimates."""
-        names = {self._words[name] for name, until in self._until.items() if step <= until}
+        names = {self._words[name] for name, until in self._until.items() if self._first[name] <= step <= until}
         return frozenset(names | {TRUTH} | ({BOUNDS} if self._with_bounds else set())), len(names)
 
     def _of(self, step: int) -> _Step:
         record = self._steps.get(step)
         if record is None:
-            parts, estimates = self._parts[bisect_left(self._ends, step)]
-            blocks = len(self._blocks)
-            record = _Step(parts, blocks * len(parts), blocks * estimates)
-            self._steps[step] = record
+            record = self._steps[step] = self._record(step)
         return record
+
+    def _record(self, step: int) -> _Step:
+        parts, estimates = self._parts[bisect_left(self._ends, step)]
+        blocks = len(self._blocks)
+        return _Step(parts, blocks * len(parts), blocks * estimates)
+
+    def _plan(self) -> None:
+        """What each step consists of, after a change of who estimates when."""
+        self._series: list[Series | CostBook] = [*self.estimators.values(), self.bounds]
+        if self.cost is not None:
+            self._series.append(self.cost)
+        self._last_estimate = max(self._until.values(), default=0)
+        begins = {first - 1 for first in self._first.values()}
+        self._ends = sorted({*self._until.values(), *begins, self._count})
+        self._parts = [self._parts_at(end) for end in self._ends]
 
     def _done(self, record: _Step, lane: int, part: str) -> None:
         record.come.append((lane, part))

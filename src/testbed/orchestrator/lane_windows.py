@@ -43,6 +43,12 @@ class LaneWindows:
         """Values of shape (F or more, M) of the lanes lane … lane + M − 1; those of a lane come in order of steps."""
         self._sums[bisect_left(self.ends, step), :, lane : lane + values.shape[1]] += values[: self._figures]
 
+    def begin_at(self, first: int) -> None:
+        """There are no values before step ``first``: the windows that begin before it have no mean."""
+        for i, begin in enumerate([0, *self.ends[:-1]]):
+            if begin + 1 < first:
+                self._sums[i] = np.nan
+
     def add_from_start(self, values: Floats) -> None:
         """Values of shape (F, K) of lane 0 at the steps 1 … K."""
         begins = [0, *(end for end in self.ends if end < values.shape[1])]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 import platform
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
+from types import MappingProxyType
 
 import numpy as np
 
@@ -19,10 +22,10 @@ from testbed.control.service import ROLE as CONTROLLER
 from testbed.estimator.bounds import held_factor
 from testbed.estimator.buffers import acks_of, largest_buffer
 from testbed.estimator.registry import model_of
-from testbed.estimator.service import role_of
 from testbed.numerics.lanes import constant
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.realtime_figures import RealTime
+from testbed.orchestrator.services import Turn
 from testbed.orchestrator.summary import (
     Z_95,
     BoundFigures,
@@ -35,6 +38,7 @@ from testbed.orchestrator.summary import (
     Timing,
     Transitions,
 )
+from testbed.orchestrator.transient import with_transients
 from testbed.plant.inputs import control_bound
 from testbed.scenario import ClosedLoop, FeedbackInput, LqgInput, Scenario
 from testbed.wire.messages import Status
@@ -53,8 +57,9 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
     }
     estimators = _estimators(conductor)
     bounds = _bounds(conductor)
-    complete = status == "complete"
-    checks = [*moment_checks(scenario), *between_bounds(scenario, estimators, bounds)]
+    complete, happened = status == "complete", conductor.happened
+    unlike = {e.estimator: e.step for e in reversed(happened) if e.action == "swap" and e.ok and e.handover != "full"}
+    checks = [*moment_checks(scenario), *between_bounds(scenario, estimators, bounds, unlike)]
     checks += rounding(collector.largest_state, estimators)
     pacing = conductor.pacing
     realtime = None if pacing is None else pacing.figures(conductor.reports.get(CONTROLLER))
@@ -80,7 +85,7 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
             "controller": _controller(conductor),
             "cost": _cost(conductor),
             "links": links,
-            "events": sorted((e for e in conductor.events if e.step <= collector.completed), key=lambda e: e.step),
+            "events": with_transients(happened, scenario, conductor.services.turns, estimators),
             "checks": checks,
             "rejected": rejected,
             "timing": timing,
@@ -194,19 +199,25 @@ def rounding(largest_state: list[float], estimators: dict[str, EstimatorFigures]
 
 
 def between_bounds(
-    scenario: Scenario, estimators: dict[str, EstimatorFigures], bounds: BoundFigures | None
+    scenario: Scenario,
+    estimators: dict[str, EstimatorFigures],
+    bounds: BoundFigures | None,
+    unlike: Mapping[str | None, int] = MappingProxyType({}),
 ) -> list[Check]:
     """Whether the mean of tr P lies between the means of the bounds, for the estimators of M Theorem 3.
 
     The lower bound holds in every lane. The upper one holds in expectation, so that the mean may exceed it by three
     standard errors, and one lane says nothing. M's proof covers i.i.d. control losses; the bound taken is one that
     holds for those of the run. With an actuator that holds it is one for OE alone.
+
+    unlike: the step from which on an estimator is not one that has run from the beginning.
     """
     checks = []
     for name, figures in estimators.items():
-        if bounds is None or figures.kind not in ("aoe", "oe"):
+        if bounds is None or figures.kind not in ("aoe", "oe") or figures.since > 1:
             continue
-        steps = [k for k, mean in enumerate(figures.trace_P_mean) if mean is not None]
+        own = figures.trace_P_mean[: unlike.get(name, scenario.steps + 1) - 1]
+        steps = [k for k, mean in enumerate(own) if mean is not None]
         upper, symbol = valid_upper(bounds)
         slack = [3.0 * (e or 0.0) for e in figures.trace_P_stderr]
         if scenario.lanes == 1 or (figures.kind == "aoe" and model_of(scenario).holds):
@@ -243,23 +254,38 @@ def _at_most(a: float | None, b: float | None, slack: float = 0.0) -> bool:
 def _estimators(conductor: Conductor) -> dict[str, EstimatorFigures]:
     scenario = conductor.setup.scenario
     out = {}
-    for spec in scenario.estimators:
-        series = conductor.collector.estimators[spec.name]
-        report = conductor.reports.get(role_of(spec.name), _SILENT)
+    services = conductor.services
+    for name, turns in services.turns.items():
+        spec, last = turns[0].spec, services.last[name]
+        series = conductor.collector.estimators[name]
         figures = {f"{key}_mean": values for key, values in series.mean.items()}
         figures |= {f"{key}_stderr": values for key, values in series.stderr.items()}
-        out[spec.name] = EstimatorFigures.model_validate(
+        out[name] = EstimatorFigures.model_validate(
             {
                 "kind": spec.kind,
                 "acks": acks_of(scenario, spec),
-                "until": spec.until,
+                "since": turns[0].first,
+                "until": last if last < scenario.steps else spec.until,
                 "nees_band_95": chi_square_band(scenario.system.n, scenario.lanes),
                 "undefined": series.undefined,
-                "counters": report.counters,
+                "counters": _counters(name, services.turns, conductor.reports),
                 **figures,
             }
         )
     return out
+
+
+def _counters(name: str, services: Mapping[str, Sequence[Turn]], reports: Mapping[str, Status]) -> dict[str, int]:
+    """Of all services of a name; one that took over the whole state goes on with the counters of the one before.
+
+    Those of a service that was promoted count under its last name.
+    """
+    total: Counter[str] = Counter()
+    elsewhere = {turn.role: of for of, turns in services.items() for turn in turns[1:] if of != name}
+    for turn, after in zip(services[name], [*services[name][1:], None], strict=True):
+        if (after is None or not after.carried) and turn.role not in elsewhere:
+            total.update(reports.get(turn.role, _SILENT).counters)
+    return dict(total)
 
 
 def _controller(conductor: Conductor) -> ControllerFigures | None:

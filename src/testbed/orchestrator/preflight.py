@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, ValidationError
+from pydantic_core import PydanticCustomError
 
 from testbed.control.registry import check as check_controller
 from testbed.errors import UsageError
 from testbed.estimator.buffers import acks_of
-from testbed.estimator.registry import check, model_of
-from testbed.scenario import Scenario
+from testbed.estimator.model import Model, Restartable
+from testbed.estimator.registry import check, checked_options, create, factory_of, model_of
+from testbed.scenario import ClosedLoop, EstimatorSpec, Scenario
 from testbed.scenario.backend import real_links
+from testbed.scenario.base import Part
+from testbed.scenario.events import AddEvent, RemoveEvent, ShadowEvent, SwapEvent
+from testbed.scenario.explain import explain
+from testbed.scenario.services import Planned, planned
+from testbed.wire.setup import Setup
+
+if TYPE_CHECKING:
+    from testbed.orchestrator.services import Services
 
 
 def check_parts(scenario: Scenario) -> None:
@@ -22,6 +36,8 @@ def check_parts(scenario: Scenario) -> None:
     model = model_of(scenario)
     for spec in scenario.estimators:
         check(spec, model, acks=acks_of(scenario, spec), scenario=scenario)
+    for plan in scenario.swaps:
+        check_change(plan, scenario, model)
     check_controller(scenario)
 
 
@@ -34,6 +50,78 @@ def check_processes(scenario: Scenario) -> None:
             f"links.{names[0]}.backend: got {backend!r} with --in-process; allowed there: model (--links model), or "
             "without --in-process"
         )
+
+
+def check_change(plan: Planned, scenario: Scenario, model: Model) -> None:
+    """Raises UsageError where the new service of a change cannot be, or cannot start from what it is to be handed."""
+    spec = plan.spec
+    if spec is None or plan.promoted is not None:
+        return
+    where = f"{plan.event.action} of {plan.event.estimator!r} at step {plan.step}"
+    try:
+        check(spec, model, acks=acks_of(scenario, spec), scenario=scenario)
+    except UsageError as error:
+        raise UsageError(f"{where}: {str(error).removeprefix(f'estimators.{spec.name}: ')}") from None
+    if plan.handover == "full" and plan.source is not None:
+        old, new = settings_of(plan.source), settings_of(spec)
+        if old != new:
+            raise UsageError(
+                f"{where}: got handover 'full' from {_shown(old)} to {_shown(new)}, which do not share the state; "
+                "allowed: moments, cold"
+            )
+    made = create(spec.kind, model, lanes=1, options=spec.options)
+    if not isinstance(made, Restartable):
+        raise UsageError(f"{where}: estimator {spec.kind!r} cannot start at a later step; allowed: in [[estimators]]")
+    if plan.handover != "full":
+        try:
+            made.start_from(plan.step - 1, model.x0_mean[None], model.P0[None])
+        except UsageError as error:
+            raise UsageError(f"{where}: {error}") from None
+
+
+def settings_of(spec: EstimatorSpec) -> tuple[str, dict[str, Any]]:
+    """The kind of an estimator and its options, those that were left out with their defaults."""
+    factory = factory_of(spec.kind)
+    parameters = list(inspect.signature(factory).parameters.values())[2:]
+    defaults = {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
+    return spec.kind, {**defaults, **checked_options(spec.kind, factory, dict(spec.options))}
+
+
+def plan_of(setup: Setup, services: Services, event: dict[str, Any], step: int) -> Planned:
+    """An event that somebody asks for while the run goes, checked against all that has happened and is to come.
+
+    Raises UsageError, of one line.
+    """
+    scenario = setup.scenario
+    try:
+        made = _Asked.model_validate({"events": ({**event, "at": step},)}).events[0]
+    except ValidationError as error:
+        raise UsageError(explain(error, _Asked).removeprefix("events[0]").lstrip(".: ")) from None
+    waiting = [(p.plan.event, p.step if p.step is not None else step) for p in services.pending]
+    source = scenario.input
+    followed = source.estimator if isinstance(source, ClosedLoop) else None
+    timeline = [*services.made, *waiting, (made, step)]
+    try:
+        plans = planned(scenario.estimators, timeline, steps=scenario.steps, followed=followed)
+    except PydanticCustomError as error:
+        raise UsageError(str((error.context or {}).get("text", error))) from None
+    plan = next(plan for plan in plans if plan.event is made)
+    check_change(plan, scenario, model_of(scenario))
+    if plan.spec is not None and acks_of(scenario, plan.spec) == "perfect" and not setup.acks_are_of_use:
+        raise UsageError("acks: got 'perfect'; allowed: none, for the plant sends no ACKs in this run")
+    return plan
+
+
+_Event = Annotated[SwapEvent | AddEvent | ShadowEvent | RemoveEvent, Field(discriminator="action")]
+
+
+class _Asked(Part):
+    events: Annotated[tuple[_Event, ...], Field(strict=False)]
+
+
+def _shown(settings: tuple[str, dict[str, Any]]) -> str:
+    options = ", ".join(f"{key} = {value!r}" for key, value in settings[1].items())
+    return f"{settings[0]!r}{f' ({options})' if options else ''}"
 
 
 def prepare_folder(out: Path) -> None:

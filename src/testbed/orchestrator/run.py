@@ -96,6 +96,8 @@ class Run:
             bus.timed = self._setup.real
             cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
             conductor = self._conductor(bus, recorder)
+            conductor.services.launch = lambda role: supervisor.start(role, endpoint, self._setup.run, transport)
+            conductor.services.drop = supervisor.end
             bus.subscribe(conductor.node.keys.warm("*"), lambda _key, _payload: None)
             importing = threading.Thread(target=_import_report, daemon=True)
             importing.start()
@@ -124,6 +126,26 @@ class Run:
         recorder = self._recorder()
         conductor = self._conductor(network.bus(), recorder)
         nodes: list[tuple[Node, Role]] = []
+
+        def join(spec: RoleSpec) -> None:
+            node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.copied)
+            nodes.append((node, spec.build(node, self._setup)))
+            node.announce()
+
+        def launch(spec: RoleSpec) -> None:
+            try:
+                join(spec)
+            except TestbedError:
+                raise
+            except Exception as error:  # as from a process that fails
+                raise RunFailed(f"{type(error).__name__}: {error}") from error
+
+        def drop(role: str) -> None:
+            for entry in [entry for entry in nodes if entry[0].name == role]:
+                nodes.remove(entry)
+                entry[0].bus.close()
+
+        conductor.services.launch, conductor.services.drop = launch, drop
         with ExitStack() as cleanup:
             interrupts = cleanup.enter_context(noted())
             cleanup.enter_context(self._raised(conductor, dict))
@@ -131,10 +153,8 @@ class Run:
                 cleanup.callback(recorder.close)
             try:
                 for spec in self._roles:
-                    node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.copied)
-                    nodes.append((node, spec.build(node, self._setup)))
-                    node.announce()
-                while not conductor.over and not interrupts.asked:
+                    join(spec)
+                while not conductor.over and not interrupts.asked and not conductor.stop_asked:
                     if not network.step():
                         conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
                     self._tell(conductor)
@@ -149,7 +169,7 @@ class Run:
 
     def _conductor(self, bus: object, recorder: Recorder | None) -> Conductor:
         conductor = Conductor(bus, self._setup, [role.name for role in self._roles], recorder)  # type: ignore[arg-type]
-        conductor.on_started = self._mark_start
+        conductor.on_started, conductor.say = self._mark_start, self._say
         return conductor
 
     def _mark_start(self) -> None:
@@ -192,7 +212,7 @@ class Run:
         """Until the run is over, has failed, or made no progress for the deadline."""
         deadline_s = self._setup.scenario.transport.deadline_ns / 1e9
         last, since, looked = -1, time.monotonic(), 0.0
-        while not conductor.over and not interrupts.asked:
+        while not conductor.over and not interrupts.asked and not conductor.stop_asked:
             bus.run(_POLL_S)  # type: ignore[attr-defined]
             now = time.monotonic()
             if now - looked < _POLL_S:
@@ -200,8 +220,8 @@ class Run:
             looked = now
             self._tell(conductor)
             for role, ending in supervisor.dead().items():
-                if role not in conductor.reports:
-                    conductor.fail(f"{role} ended: {ending}{_last_words(supervisor.log_of(role))}")
+                conductor.ended(role, f"{ending}{_last_words(supervisor.log_of(role))}")
+            conductor.tick(deadline_s)
             if conductor.activity != last:
                 last, since = conductor.activity, now
             elif now - since > deadline_s and not (patient and not conductor.started):
@@ -238,10 +258,14 @@ class Run:
             steps_per_s=completed / wall if wall > 0 else None,
             lane_steps_per_s=completed * lanes / wall if wall > 0 else None,
             window=self._setup.window,
+            swaps=tuple(conductor.services.downtimes),
         )
-        if interrupted and not conductor.collector.finished:
+        conductor.services.give_up()
+        if conductor.stop_asked and not conductor.collector.finished:
             status = "interrupted"
-            reason: str | None = "interrupted by the user"
+            reason: str | None = "stopped by command"
+        elif interrupted and not conductor.collector.finished:
+            status, reason = "interrupted", "interrupted by the user"
         elif conductor.failure is not None:
             status, reason = "failed", conductor.failure
         else:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from testbed.errors import UsageError
+from testbed.orchestrator.summary import Happened, read_summary
 from testbed.scenario import Transport
 
 NAME = "run.json"
+_POLL_S = 0.05
 
 
 @contextmanager
@@ -29,8 +32,18 @@ def published(out: Path, run: str, endpoint: str, transport: Transport) -> Itera
         path.unlink(missing_ok=True)
 
 
+Ask = Callable[[dict[str, Any]], dict[str, Any]]
+
+
 def ask(out: Path, question: dict[str, Any], patience_s: float = 10.0) -> dict[str, Any]:
     """The answer of the run in a folder. Raises UsageError where none goes there, or where it refuses."""
+    with asking(out, patience_s) as put:
+        return put(question)
+
+
+@contextmanager
+def asking(out: Path, patience_s: float = 10.0) -> Iterator[Ask]:
+    """A function that asks the run in a folder. It raises UsageError where the run refuses or is not there any more."""
     from testbed.wire.bus import BusError
     from testbed.wire.keys import Keys
     from testbed.wire.session import closing, open_client
@@ -47,12 +60,42 @@ def ask(out: Path, question: dict[str, Any], patience_s: float = 10.0) -> dict[s
         raise UsageError(f"{out / NAME}: not written by a run") from None
     if not alive:
         raise UsageError(f"{out}: its run ended without a word; allowed: the folder of a run that goes")
-    try:
-        with closing(open_client(transport, endpoint)) as session:
-            bus = ZenohBus(session, deadline_s=patience_s)
+
+    def put(question: dict[str, Any]) -> dict[str, Any]:
+        try:
             answer: dict[str, Any] = json.loads(bus.ask(Keys(run).ask, json.dumps(question).encode()))
+        except BusError as error:
+            raise UsageError(f"{out}: its run gave no answer: {error}") from None
+        if "error" in answer:
+            raise UsageError(str(answer["error"]))
+        return answer
+
+    try:
+        session = open_client(transport, endpoint)
     except BusError as error:
         raise UsageError(f"{out}: its run gave no answer: {error}") from None
-    if "error" in answer:
-        raise UsageError(str(answer["error"]))
-    return answer
+    with closing(session):
+        bus = ZenohBus(session, deadline_s=patience_s)
+        yield put
+
+
+def outcome_of(out: Path, put: Ask, number: int) -> Happened:
+    """What became of a change of estimators that was asked for; waits for it.
+
+    Raises UsageError where the run ends without a word of it.
+    """
+    while True:
+        try:
+            status = put({"do": "status"})
+            found = [Happened.model_validate(event) for event in status["events"]]
+        except UsageError:
+            if (out / NAME).exists():
+                raise
+            found = list(read_summary(out / "summary.json").events)
+            status = {"pending": []}
+        for event in found:
+            if event.number == number:
+                return event
+        if number not in status["pending"]:
+            raise UsageError(f"{out}: its run ended before")
+        time.sleep(_POLL_S)

@@ -85,6 +85,12 @@ class Series:
         if self._windows is not None:
             self._windows.add(step, lane, values)
 
+    def begin_at(self, first: int, completed: int) -> None:
+        """There are no figures before step ``first``; so many steps are complete already."""
+        self._closed += [None] * completed
+        if self._windows is not None:
+            self._windows.begin_at(first)
+
     def close(self, step: int) -> None:
         """The next step is complete: keep its figures and forget the sums."""
         figures = self._open.pop(step, None)

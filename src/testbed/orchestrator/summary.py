@@ -55,8 +55,9 @@ class _Model(BaseModel):
 class EstimatorFigures(_Model):
     """Figures of one estimator; means and standard errors are over lanes."""
 
-    kind: str
+    kind: str = Field(description="which estimator it is, at first")
     acks: Literal["none", "perfect", "link"]
+    since: NonNegativeInt = Field(default=1, description="first step at which it runs")
     until: NonNegativeInt | None = Field(
         default=None, description="last step at which it runs; null: the last of the run"
     )
@@ -174,13 +175,58 @@ class Check(_Model):
     text: str
 
 
+class Transient(_Model):
+    """The error of an estimator after a swap, less that of a twin: of the new kind all along, and never swapped."""
+
+    twin: str = Field(description="name of the twin")
+    last: NonNegativeInt = Field(description="last step that was compared: the last before the next change, or of all")
+    mean: Number = Field(description="mean over these steps of the difference of ‖x − x̂‖²")
+    largest: Number = Field(description="the largest difference of ‖x − x̂‖², without its sign")
+    settled: NonNegativeInt | None = Field(
+        description="first step from which on it stays below 1 % of the twin's ‖x − x̂‖²; null: it does not"
+    )
+
+
 class Happened(_Model):
     """An event, and the step at which it took effect."""
 
     step: NonNegativeInt
     by: Literal["timeline", "command"] = Field(description="whether the scenario or somebody outside asked for it")
-    link: str = Field(description="which link")
-    set: dict[str, Any] = Field(description="keys of the link that changed")
+    action: Literal["set", "swap", "add", "shadow", "remove"] = Field(default="set", description="what happened")
+    link: str | None = Field(default=None, description="which link")
+    set: dict[str, Any] | None = Field(default=None, description="keys of the link that changed")
+    number: NonNegativeInt | None = Field(default=None, description="number among the changes of estimators, from 0")
+    estimator: str | None = Field(default=None, description="which estimator")
+    name: str | None = Field(default=None, description="name of the shadow")
+    to: dict[str, Any] | str | None = Field(
+        default=None, description="the new service: its table, or the name under which it ran"
+    )
+    handover: Literal["cold", "moments", "full"] | None = Field(default=None, description="what it started from")
+    ok: bool = Field(default=True, description="whether it was done; if not, all stayed as it was")
+    reason: str | None = Field(default=None, description="why it was not done")
+    bytes: NonNegativeInt | None = Field(default=None, description="size of the snapshots that were handed over")
+    transient: Transient | None = Field(default=None, description="what the swap cost, where the run has a twin")
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        if self.action == "set":
+            return f"link {self.link} changed"
+        what = f"{self.action} {self.estimator}"
+        if isinstance(self.to, str):
+            what += f" to {self.to}"
+        elif self.to is not None:
+            what += f" to {self.to['kind']}" + (f", {self.handover}" if self.handover is not None else "")
+        return what if self.ok else f"{what}: not done: {self.reason}"
+
+
+class Downtime(_Model):
+    """How long the clock stood still for a change of estimators; no step was left out."""
+
+    step: NonNegativeInt
+    estimator: str
+    steps: NonNegativeInt = Field(default=0, description="steps without an estimate of it")
+    ms: Number = Field(description="on the wall clock, from the last estimate before to the clock that goes on")
 
 
 class Timing(_Model):
@@ -191,6 +237,7 @@ class Timing(_Model):
     steps_per_s: Number = None
     lane_steps_per_s: Number = None
     window: NonNegativeInt | None = None
+    swaps: tuple[Downtime, ...] = Field(default=(), description="how long changes of estimators held up the run")
 
 
 class Summary(_Model):

@@ -62,6 +62,12 @@ class Supervisor:
         except subprocess.TimeoutExpired:
             return None
 
+    def end(self, role: str) -> None:
+        """End a role's process that is not wanted any more."""
+        process = self._processes.get(role)
+        if process is not None and process.poll() is None:
+            process.kill()
+
     def close(self, patience_s: float) -> None:
         """Wait for all to leave; end those that do not. Empty logs are removed."""
         deadline = time.monotonic() + patience_s

@@ -23,28 +23,11 @@ def _own_name(data: dict[str, Any]) -> Any:
     return data["name"]
 
 
-class EstimatorSpec(Part):
-    """An estimator. Keys of its table that are not fields here are its `options`."""
+class _WithOptions(Part):
+    """A table whose keys that are not fields are its `options`."""
 
     model_config = ConfigDict(json_schema_extra=_schema)
-    reserved: ClassVar[tuple[str, ...]] = ("name", "kind", "acks", "until", "buffer")
-
-    name: Name = Field(description="Name in the results; unique.")
-    kind: Name = Field(default_factory=_own_name, description="Which estimator it is; default its name.")
-    acks: Literal["none", "perfect"] | None = Field(
-        default=None, description="What it is told of the control packets; left out: that of [links.ack]."
-    )
-    until: Count | None = Field(
-        default=None, description="The last step at which it runs, 1 … steps; left out: the last step of all."
-    )
-    buffer: int | None = Field(
-        default=None,
-        ge=0,
-        le=COUNT_MAX,
-        description="Steps that it can go back when an observation or ACK comes late, 0 or more; left out: "
-        "20 where links can be late, else 0.",
-    )
-    options: dict[str, Any] = Field(default_factory=dict, description="Every other key of its table.")
+    reserved: ClassVar[tuple[str, ...]]
 
     @model_validator(mode="before")
     @classmethod
@@ -65,6 +48,62 @@ class EstimatorSpec(Part):
         rest = {key: value for key, value in data.items() if key not in cls.model_fields}
         own["options"] = plain_options({**given, **rest})
         return own
+
+
+class EstimatorSpec(_WithOptions):
+    """An estimator. Keys of its table that are not fields here are its `options`."""
+
+    reserved: ClassVar[tuple[str, ...]] = ("name", "kind", "acks", "until", "buffer")
+
+    name: Name = Field(description="Name in the results; unique.")
+    kind: Name = Field(default_factory=_own_name, description="Which estimator it is; default its name.")
+    acks: Literal["none", "perfect"] | None = Field(
+        default=None, description="What it is told of the control packets; left out: that of [links.ack]."
+    )
+    until: Count | None = Field(
+        default=None, description="The last step at which it runs, 1 … steps; left out: the last step of all."
+    )
+    buffer: int | None = Field(
+        default=None,
+        ge=0,
+        le=COUNT_MAX,
+        description="Steps that it can go back when an observation or ACK comes late, 0 or more; left out: "
+        "20 where links can be late, else 0.",
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="Every other key of its table.")
+
+
+class NewService(_WithOptions):
+    """What estimates from an event on. Keys of its table that are not fields here are its `options`."""
+
+    reserved: ClassVar[tuple[str, ...]] = ("kind", "acks", "until", "buffer")
+
+    kind: Name = Field(description="Which estimator it is.")
+    acks: Literal["none", "perfect"] | None = Field(
+        default=None,
+        description="What it is told of the control packets; left out: as the one before or beside it, or that of "
+        "[links.ack].",
+    )
+    until: Count | None = Field(default=None, description="The last step at which it runs; left out: the last of all.")
+    buffer: int | None = Field(
+        default=None,
+        ge=0,
+        le=COUNT_MAX,
+        description="Steps that it can go back when an observation or ACK comes late; left out: as the one before or "
+        "beside it, or as in [[estimators]].",
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="Every other key of its table.")
+
+    def named(self, name: str, like: EstimatorSpec | None = None) -> EstimatorSpec:
+        """As an estimator of the scenario, with the ACKs and the buffer of ``like`` where it has none of its own."""
+        return EstimatorSpec(
+            name=name,
+            kind=self.kind,
+            acks=self.acks if self.acks is not None or like is None else like.acks,
+            until=self.until,
+            buffer=self.buffer if self.buffer is not None or like is None else like.buffer,
+            options=self.options,
+        )
 
 
 def plain_options(options: dict[str, Any]) -> dict[str, Any]:

@@ -1,11 +1,12 @@
 """From the errors of validation to one line: where, what was given, what is allowed, the nearest match."""
 
 import types
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import annotated_types
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Tag, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
@@ -15,8 +16,10 @@ from testbed.scenario.estimators import NAME_ALLOWED, NAME_PATTERN
 from testbed.scenario.models import Scenario
 from testbed.scenario.replays import WORD_PATTERN
 
-Target = type[BaseModel] | dict[str, type[BaseModel]] | None
-"""What lies below a field: a model, the models of a union by their kind, or neither."""
+Target = type[BaseModel] | dict[str, "type[BaseModel] | None"] | None
+"""What lies below a field: a model, the members of a union by their tag (None: one that is no model), or neither."""
+_TAGS = ("kind", "action")
+_A = {"kind": "a kind", "action": "an action"}
 
 
 @dataclass(frozen=True)
@@ -85,9 +88,26 @@ def _target(annotation: Any) -> Target:
         members = [member for member in get_args(annotation) if member is not type(None)]
         if len(members) == 1:
             return _target(members[0])
-        models = [member for member in members if isinstance(member, type) and issubclass(member, BaseModel)]
-        return {get_args(model.model_fields["kind"].annotation)[0]: model for model in models} or None
+        return {tag: model for member in members for tag, model in _member(member)} or None
     return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+
+
+def _member(annotation: Any) -> list[tuple[str, type[BaseModel] | None]]:
+    """The tag of a member of a union, and its model; nothing for one without a tag."""
+    if get_origin(annotation) is Annotated:
+        inner, *metadata = get_args(annotation)
+        model = inner if isinstance(inner, type) and issubclass(inner, BaseModel) else None
+        return [(entry.tag, model) for entry in metadata if isinstance(entry, Tag)]
+    if not isinstance(annotation, type) or not issubclass(annotation, BaseModel):
+        return []
+    tag = _tag_key([annotation])
+    return [(get_args(annotation.model_fields[tag].annotation)[0], annotation)]
+
+
+def _tag_key(models: Iterable[type[BaseModel] | None]) -> str:
+    """The key that tells the members of a union apart."""
+    fields = [set(model.model_fields) for model in models if model is not None]
+    return next(tag for tag in _TAGS if all(tag in names for names in fields))
 
 
 def _unknown_key(place: Place) -> str:
@@ -107,11 +127,11 @@ def _wrong_value(entry: ErrorDetails, place: Place) -> str:
     if kind == "missing":
         return f"{place.path}: missing; needed: {_described(place)}"
     if kind in ("union_tag_invalid", "union_tag_not_found") and isinstance(place.target, dict):
-        kinds = list(place.target)
+        kinds, key = list(place.target), _tag_key(place.target.values())
         if kind == "union_tag_not_found":
-            return f"{place.path}.kind: missing; allowed: {', '.join(kinds)}"
-        tag = given.get("kind") if isinstance(given, dict) else given
-        return f"{place.path}.kind: got {shown(tag)}; allowed: {', '.join(kinds)}{_hint(tag, kinds)}"
+            return f"{place.path}.{key}: missing; allowed: {', '.join(kinds)}"
+        tag = given.get(key) if isinstance(given, dict) else given
+        return f"{place.path}.{key}: got {shown(tag)}; allowed: {', '.join(kinds)}{_hint(tag, kinds)}"
     where = f"{place.path}: " if place.path else ""
     return f"{where}got {shown(given)}; allowed: {allowed(place)}{_hint(given, _choices(place))}"
 
@@ -158,7 +178,7 @@ def allowed(place: Place) -> str:
     if choices := _choices(place):
         return ", ".join(choices)
     if isinstance(place.target, dict):
-        return f"a table with a kind: {', '.join(place.target)}"
+        return f"a table with {_A[_tag_key(place.target.values())]}: {', '.join(place.target)}"
     plain = _plain(place.field.annotation)
     if place.target is not None:
         return f"an array of tables, [[{place.key}]]" if get_origin(plain) is tuple else "a table"

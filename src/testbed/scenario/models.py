@@ -13,9 +13,10 @@ from testbed.scenario.closed_loop import ClosedLoop, FeedbackInput, LqgInput, Pi
 from testbed.scenario.cost import Cost
 from testbed.scenario.durations import format_duration, parse_duration
 from testbed.scenario.estimators import EstimatorSpec
-from testbed.scenario.events import LinkEvent
+from testbed.scenario.events import ESTIMATOR_EVENTS, EstimatorEvent, Event, LinkEvent
 from testbed.scenario.inputs import ConstantInput, Input, TableInput, check_channels
 from testbed.scenario.links import AckLink, Links, SteppedImpairments
+from testbed.scenario.services import Planned, planned
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Transport
 from testbed.scenario.uncertainty import Uncertainty
@@ -69,8 +70,8 @@ class Scenario(Part):
     )
     links: Links = Field(default_factory=Links, description="The links between the parts.")
     transport: Transport = Field(default_factory=Transport, description="How the processes of a run talk.")
-    events: Annotated[tuple[LinkEvent, ...], Field(strict=False)] = Field(
-        default=(), description="The timeline: what changes while the run goes."
+    events: Annotated[tuple[Event, ...], Field(strict=False)] = Field(
+        default=(), description="The timeline: what happens while the run goes."
     )
 
     @field_validator("uncertainty")
@@ -113,11 +114,26 @@ class Scenario(Part):
 
     @field_validator("events")
     @classmethod
-    def _check_events(cls, events: tuple[LinkEvent, ...], info: ValidationInfo) -> tuple[LinkEvent, ...]:
+    def _check_events(cls, events: tuple[Event, ...], info: ValidationInfo) -> tuple[Event, ...]:
         if {"links", "clock", "steps"} <= info.data.keys():
-            for i in range(len(events)):
-                _check_event(info.data["links"], events, i, info.data["clock"], info.data["steps"])
+            for i, event in enumerate(events):
+                if info.data["clock"].mode == "real" and not isinstance(event, LinkEvent):
+                    raise problem(
+                        f"got {event.action!r} with clock mode 'real', which does not wait for a new estimator; "
+                        "allowed there: set",
+                        f"[{i}].action",
+                    )
+                if isinstance(event, LinkEvent):
+                    _check_event(info.data["links"], events, i, info.data["clock"], info.data["steps"])
+        if {"estimators", "input", "clock", "steps"} <= info.data.keys():
+            source: Input | None = info.data["input"]
+            _planned(events, info.data["estimators"], source, info.data["clock"], info.data["steps"])
         return events
+
+    @property
+    def swaps(self) -> list[Planned]:
+        """The events of estimators, resolved, in the order of time."""
+        return _planned(self.events, self.estimators, self.input, self.clock, self.steps)
 
     def changes_of(self, link: str) -> list[tuple[int, dict[str, Any]]]:
         """(step, keys with their new values) of a link's events, in the order of time."""
@@ -184,9 +200,24 @@ def _check_times(links: Links, clock: Clock) -> None:
             )
 
 
-def _check_event(links: Links, events: Sequence[LinkEvent], i: int, clock: Clock, steps: int) -> None:
+def _planned(
+    events: Sequence[Event], specs: Sequence[EstimatorSpec], source: Input | None, clock: Clock, steps: int
+) -> list[Planned]:
+    """The events of estimators in the order of time; a problem of validation where one does not fit."""
+    followed = source.estimator if isinstance(source, ClosedLoop) else None
+    places = [i for i, event in enumerate(events) if isinstance(event, ESTIMATOR_EVENTS)]
+    timed: list[tuple[EstimatorEvent, int]] = []
+    for i in places:
+        event = events[i]
+        assert isinstance(event, ESTIMATOR_EVENTS)
+        timed.append((event, event.step(clock.period_ns)))
+    return planned(specs, timed, steps=steps, followed=followed, places=places)
+
+
+def _check_event(links: Links, events: Sequence[Event], i: int, clock: Clock, steps: int) -> None:
     """A problem of validation where an event does not fit the link as those before it have left it."""
     event = events[i]
+    assert isinstance(event, LinkEvent)
     if event.step(clock.period_ns) > steps:
         raise problem(f"got {shown(event.at)}; allowed: at most {steps}, the steps of the scenario", f"[{i}].at")
     if event.link == "ack" and links.ack.mode != "link":
@@ -199,9 +230,10 @@ def _check_event(links: Links, events: Sequence[LinkEvent], i: int, clock: Clock
         raise problem(str(error), f"[{i}].set") from None
 
 
-def _in_time(events: Sequence[LinkEvent], link: str, clock: Clock) -> list[LinkEvent]:
+def _in_time(events: Sequence[Event], link: str, clock: Clock) -> list[LinkEvent]:
     """The events of a link in the order of time; those of one step as they are written."""
-    return sorted((e for e in events if e.link == link), key=lambda e: e.step(clock.period_ns))
+    of_link = [e for e in events if isinstance(e, LinkEvent) and e.link == link]
+    return sorted(of_link, key=lambda e: e.step(clock.period_ns))
 
 
 def _closed_loop(source: Following, info: ValidationInfo) -> Following:

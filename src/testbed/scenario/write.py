@@ -19,9 +19,13 @@ def to_dict(scenario: Scenario) -> dict[str, Any]:
         table["estimators"] = [_flat(spec) for spec in estimators]
     events = table.pop("events")
     if events:
-        table["events"] = events
+        table["events"] = [_with_flat_service(event) for event in events]
     result: dict[str, Any] = table
     return result
+
+
+def _with_flat_service(event: dict[str, Any]) -> dict[str, Any]:
+    return {**event, "to": _flat(event["to"])} if isinstance(event.get("to"), dict) else event
 
 
 def _flat(spec: dict[str, Any]) -> dict[str, Any]:

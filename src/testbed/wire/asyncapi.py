@@ -47,7 +47,11 @@ def asyncapi() -> dict[str, Any]:
                 f"(TOML). A query on {keys.ask} with JSON, the link and the keys of its table to set, changes a link "
                 "while the run goes. A role declares its subscriptions, then the liveliness token "
                 f"{keys.presence('{role}')}; "
-                "the run starts when all are there. Each key has one sender; seq counts its messages from 0. What a "
+                "the run starts when all are there. Each key has one sender, and that of an estimate may change from "
+                "one step to the next, with the numbers going on; "
+                "seq counts its messages from 0. What joins at step k passes over the packets before, and counts them. "
+                f"A query on {keys.handover('{role}')} orders an estimator's service to give or take a snapshot, to "
+                "serve another name, or to leave. What a "
                 f"role publishes on {keys.warm('{role}')} is read by nobody."
             ),
         },

@@ -60,6 +60,10 @@ class Keys:
     def estimate(self, name: str) -> str:
         return f"{self.prefix}/estimate/{name}"
 
+    def handover(self, role: str) -> str:
+        """Ask an estimator's service here to give or take a state, to give the estimates of a name, or to leave."""
+        return f"{self.prefix}/handover/{role}"
+
     def status(self, role: str) -> str:
         return f"{self.prefix}/status/{role}"
 

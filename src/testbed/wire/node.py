@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
@@ -19,6 +20,19 @@ M = TypeVar("M", bound=Message)
 PacketHandler = Callable[[M, dict[str, NDArray[Any]]], None]
 
 ORCHESTRATOR = "orchestrator"
+
+
+class Gate:
+    """Lets packets pass from some step on: of a role that joins while the run goes.
+
+    passed_over: packets of each block of lanes that are of no interest, counted from the first of the run; None: all.
+    """
+
+    def __init__(self, passed_over: int | None = None) -> None:
+        self.passed_over = passed_over
+
+
+OPEN = Gate(0)
 
 
 class Send(Protocol):
@@ -43,20 +57,26 @@ class Node:
         self.leaving = ExitStack()
         """What is to be done when the role leaves."""
         self._tap = tap
+        self._blocks = -(-sizes.lanes // (sizes.lanes_per_packet or sizes.lanes))
         self._status_seq = 0
         self._status = bus.publisher(self.keys.status(name))
         if name != ORCHESTRATOR:
             self.on(self.keys.command, Command, ORCHESTRATOR, self._obey)
 
-    def sender(self, key: str, model: type[Packet], *, tap: bool = False, lazy: bool = False) -> Send:
+    def sender(
+        self, key: str, model: type[Packet], *, tap: bool = False, lazy: bool = False, gate: Gate = OPEN
+    ) -> Send:
         """A function that publishes packets of one type on one key, numbered.
 
-        tap: copy them for the recording. lazy: nothing waits for them (see Bus.publisher).
+        tap: copy them for the recording. lazy: nothing waits for them (see Bus.publisher). gate: packets that it did
+        not send, or that somebody else sent, and that count in the numbers.
         """
-        send = _numbered(self.bus.publisher(key, lazy=lazy), PacketEncoder(model, self.run, self.name))
+        encoder = PacketEncoder(model, self.run, self.name)
+        send = _numbered(self.bus.publisher(key, lazy=lazy), encoder, gate, self._blocks)
         if not tap or not self._tap or self._tap >= self.sizes.lanes:
             return send
-        copy = _numbered(self.bus.publisher(self.keys.tap(key), lazy=True), PacketEncoder(model, self.run, self.name))
+        encoder = PacketEncoder(model, self.run, self.name)
+        copy = _numbered(self.bus.publisher(self.keys.tap(key), lazy=True), encoder, OPEN, 0)
         recorded = self._tap
 
         def send_both(step: int, lane: int, lanes: int, arrays: Arrays) -> None:
@@ -71,23 +91,27 @@ class Node:
         self,
         key: str,
         model: type[M],
-        source: str,
+        source: str | Callable[[M], bool],
         handler: PacketHandler[M],
         *,
         needs: tuple[str, ...] = (),
         last: int | None = None,
         cut: bool = False,
+        gate: Gate = OPEN,
     ) -> None:
         """Call ``handler(header, arrays)`` for each valid message of ``source`` on ``key``; count the others.
 
         Packets come as the run splits the lanes, and the steps of each block one after the other.
 
-        needs: arrays that a packet must have here. last: the last step, where it is not that of the run. cut: packets
-        hold the recorded lanes only.
+        source: the role that sends here, or what says of a header whether its sender is right. needs: arrays that a
+        packet must have here. last: the last step, where it is not that of the run. cut: packets hold the recorded
+        lanes only. gate: the packets that are passed over at first; the first that is taken has the number that it
+        must have had all before it come.
         """
         sizes = self.sizes if last is None else replace(self.sizes, steps=last)
         decoder, turns = Decoder(model, self.run, sizes), _Turns(None if cut else sizes.lanes_per_packet, sizes.lanes)
-        expected = 0
+        is_source = source if callable(source) else partial(_is_from, source)
+        expected = 0 if gate.passed_over == 0 else None
 
         def receive(_: str, payload: bytes) -> None:
             nonlocal expected
@@ -96,8 +120,12 @@ class Node:
                     if isinstance(outcome, Rejected):
                         raise outcome
                     header, arrays = outcome
-                    if header.source != source:
-                        raise Rejected("source", f"from {header.source}, expected {source}")
+                    if expected is None:
+                        if not isinstance(header, Packet) or not _is_due(header, gate):
+                            continue
+                        expected = turns.begin(gate.passed_over or 0, header)
+                    if not is_source(header):
+                        raise Rejected("source", f"from {header.source}")
                     if header.seq != expected:
                         raise Rejected("sequence", f"number {header.seq}, expected {expected}")
                     for name in needs:
@@ -144,6 +172,13 @@ class _Turns:
         self._per_packet, self._lanes = per_packet, lanes
         self._due: dict[int, int] = {}
 
+    def begin(self, passed_over: int, packet: Packet) -> int:
+        """Let so many packets of each block be done; the number of the next one on the key."""
+        size = self._per_packet or self._lanes
+        for lane in range(0, self._lanes, size):
+            self._due[lane] = packet.FIRST_STEP + passed_over
+        return passed_over * len(self._due)
+
     def check(self, packet: Packet) -> None:
         lane, size = packet.lane, self._per_packet
         if size is not None and (lane % size or packet.lanes != min(size, self._lanes - lane)):
@@ -156,11 +191,21 @@ class _Turns:
         self._due[lane] = due + 1
 
 
-def _numbered(publish: Publish, encoder: PacketEncoder) -> Send:
-    seq = 0
+def _is_from(source: str, header: Message) -> bool:
+    return header.source == source
+
+
+def _is_due(packet: Packet, gate: Gate) -> bool:
+    return gate.passed_over is not None and packet.step - packet.FIRST_STEP >= gate.passed_over
+
+
+def _numbered(publish: Publish, encoder: PacketEncoder, gate: Gate, blocks: int) -> Send:
+    seq = 0 if gate.passed_over == 0 else -1
 
     def send(step: int, lane: int, lanes: int, arrays: Arrays) -> None:
         nonlocal seq
+        if seq < 0:
+            seq = (gate.passed_over or 0) * blocks
         publish(encoder.encode(seq, step, lane, lanes, arrays))
         seq += 1
 

@@ -130,7 +130,9 @@ class Setup:
     def acks_are_of_use(self) -> bool:
         """Whether anybody takes the plant's ACKs: an ack link, an estimator that gets them directly, the recording."""
         s = self.scenario
-        return s.links.ack.mode != "none" or s.record != "none" or any(e.acks == "perfect" for e in s.estimators)
+        specs = [*s.estimators, *(planned.spec for planned in s.swaps)]
+        told = any(spec is not None and spec.acks == "perfect" for spec in specs)
+        return s.links.ack.mode != "none" or s.record != "none" or told
 
     @property
     def costs_input(self) -> bool:

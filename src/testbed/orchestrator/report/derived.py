@@ -48,9 +48,9 @@ def steps_run(figures: EstimatorFigures, completed_steps: int) -> int:
 def settled(figures: EstimatorFigures, completed_steps: int) -> Settled | None:
     """The last quarter of the steps that the estimator ran; None if it ran none."""
     last = steps_run(figures, completed_steps)
-    if last == 0:
+    if last < figures.since:
         return None
-    first = first_settled(last)
+    first = figures.since - 1 + first_settled(last - figures.since + 1)
 
     def quarter(series: Series) -> float | None:
         return mean(as_vector(series)[first - 1 : last])
@@ -65,7 +65,7 @@ def settled(figures: EstimatorFigures, completed_steps: int) -> Settled | None:
         nees=quarter(figures.nees_mean),
         nees_in_band=_share(nees_in_band(figures)),
         excess_consistent=_share(excess_consistent(figures)),
-        missing=sum(value is None for value in figures.trace_P_mean[:last]),
+        missing=sum(value is None for value in figures.trace_P_mean[figures.since - 1 : last]),
     )
 
 
