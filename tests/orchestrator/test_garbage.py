@@ -44,8 +44,8 @@ class Noisy(MemoryNetwork):
 
     current: Noisy
 
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__(seed)
+    def __init__(self, seed: int | None = None, **rest: Any) -> None:
+        super().__init__(seed, **rest)
         type(self).current = self
         self.rng = random.Random(1)
         self.seen: dict[str, list[bytes]] = {}

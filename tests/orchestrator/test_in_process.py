@@ -328,8 +328,8 @@ class Watched(MemoryNetwork):
 
     current: Watched
 
-    def __init__(self, seed: int | None = None) -> None:
-        super().__init__(seed)
+    def __init__(self, seed: int | None = None, **rest: Any) -> None:
+        super().__init__(seed, **rest)
         type(self).current = self
         self.buses: list[MemoryBus] = []
         self.published: list[tuple[str, bytes]] = []
