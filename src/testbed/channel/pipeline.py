@@ -63,7 +63,7 @@ class Pipeline:
             self._bottleneck.change(settings.rate)
         delay = settings.delay
         self._delay = None if delay is None else law_of(delay)
-        self._constant_ns = law_of(delay)(0.0) if isinstance(delay, ConstantDelay) else None
+        self._constant_ns = self._delay(0.0) if self._delay is not None and isinstance(delay, ConstantDelay) else None
         self._in_order = delay is not None and not isinstance(delay, ConstantDelay) and delay.in_order
         self._delays = self._stream("delay")
         self._hold_chance, self._hold_ns = 0.0, 0

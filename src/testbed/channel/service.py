@@ -16,7 +16,7 @@ from testbed.channel.real.pace import Pace
 from testbed.channel.real.service import RealLinkService
 from testbed.channel.real.timer import Timer
 from testbed.channel.steps import SteppedLink
-from testbed.channel.timed import TimedBlock, room, timed_counters
+from testbed.channel.timed import TimedBlock, blanked, room, timed_counters
 from testbed.numerics.lanes import Mask, any_of
 from testbed.numerics.streams import Stream
 from testbed.scenario import AckLink, Link, Loss, NoLoss, Scenario
@@ -172,10 +172,7 @@ class LinkService:
         content = arrays[self._content]
         if isinstance(arrived, bool):
             return {self._content: content, "mask": _ARRIVED}
-        if not arrived.all():
-            content = content.copy()
-            content[~arrived] = 0
-        return {self._content: content, "mask": arrived.astype(np.uint8)}
+        return {self._content: blanked(content, arrived), "mask": arrived.astype(np.uint8)}
 
 
 _ARRIVED = np.ones(1, dtype=np.uint8)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from testbed.channel.books import Books
 from testbed.channel.loss import LossCounts
-from testbed.channel.steps import StepLink
+from testbed.channel.steps import Arrivals, StepLink
 from testbed.numerics.lanes import Bools
 from testbed.scenario.links import Impairments
 
@@ -63,16 +63,14 @@ class TimedBlock:
 
     def in_time(self, number: int) -> Bools:
         """Send a packet of which only what is in time is of use; the rest is late, and not handed over."""
-        arrivals = self._link.send(number)
+        arrivals = self._send(number)
         self._late += sum(int(np.count_nonzero(lanes)) for _, lanes in arrivals.late)
-        self.counts.count(0, arrivals.in_time if self._lanes > 1 else bool(arrivals.in_time[0]))
         return arrivals.in_time
 
     def pass_on(self, number: int, content: NDArray[Any]) -> Arrays:
         """Send packet ``number``, content (M, …), and what is delivered before the next: arrays of a message."""
         self._remember(number, content)
-        arrivals = self._link.send(number)
-        self.counts.count(0, arrivals.in_time if self._lanes > 1 else bool(arrivals.in_time[0]))
+        arrivals = self._send(number)
         fresh: dict[int, Bools] = {}
         for packet, lanes in [*arrivals.late, (number, arrivals.in_time)]:
             if packet < number:
@@ -90,15 +88,20 @@ class TimedBlock:
         mask = fresh.pop(number, np.zeros(self._lanes, dtype=np.bool_))
         out: Arrays = {"mask": mask.astype(np.uint8)}
         if mask.any():
-            out = {self._name: _blanked(content, mask), **out}
+            out = {self._name: blanked(content, mask), **out}
         return {**out, **self._late_arrays(sorted(fresh.items()))}
+
+    def _send(self, number: int) -> Arrivals:
+        arrivals = self._link.send(number)
+        self.counts.count(0, arrivals.in_time if self._lanes > 1 else bool(arrivals.in_time[0]))
+        return arrivals
 
     def _late_arrays(self, late: list[tuple[int, Bools]]) -> Arrays:
         if not late:
             return {}
         steps = np.array([float(number + self._first_step) for number, _ in late])
         return {
-            f"late_{self._name}": np.stack([_blanked(self._contents[n], lanes) for n, lanes in late], axis=1),
+            f"late_{self._name}": np.stack([blanked(self._contents[n], lanes) for n, lanes in late], axis=1),
             "late_mask": np.stack([lanes for _, lanes in late], axis=1).astype(np.uint8),
             "late_step": np.tile(steps, (self._lanes, 1)),
         }
@@ -116,7 +119,7 @@ def room(lanes: int, entry_bytes: int, batch: int) -> int:
     return max(_KEEP_LEAST, batch, _KEEP_BYTES // (lanes * entry_bytes + _KEEP_BESIDE))
 
 
-def _blanked(content: NDArray[Any], lanes: Bools) -> NDArray[Any]:
+def blanked(content: NDArray[Any], lanes: Bools) -> NDArray[Any]:
     """The content with zeros in the other lanes."""
     if lanes.all():
         return content

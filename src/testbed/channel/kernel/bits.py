@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from testbed.channel.flips import flipped
+
 
 def with_flipped_bit(packet: bytes, flip: int) -> bytes:
     """The packet with bit ``flip`` mod (number of bits behind the IP header) flipped; bit 0 is the first byte's lowest.
@@ -9,10 +11,4 @@ def with_flipped_bit(packet: bytes, flip: int) -> bytes:
     A packet of nothing but its header stays as it is.
     """
     head = 40 if packet[0] >> 4 == 6 else 4 * (packet[0] & 0x0F)
-    bits = 8 * (len(packet) - head)
-    if bits <= 0:
-        return packet
-    where, bit = divmod(flip % bits, 8)
-    out = bytearray(packet)
-    out[head + where] ^= 1 << bit
-    return bytes(out)
+    return flipped(packet, flip, head)

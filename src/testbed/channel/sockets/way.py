@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from testbed.channel.flips import flipped
 from testbed.channel.pipeline import Pipeline
 from testbed.channel.schedule import Schedule
 from testbed.channel.sockets.loop import OVERDUE_NS
@@ -92,16 +93,6 @@ class Way:
         self.pipeline.books.drop(cause)
         if self.trace is not None:
             self.trace.lost(number, sent_ns)
-
-
-def flipped(data: bytes, flip: int) -> bytes:
-    """``data`` with one bit flipped: bit number flip mod 8 · size, counted from the lowest bit of the first byte."""
-    if not data:
-        return data
-    byte, bit = divmod(flip % (8 * len(data)), 8)
-    changed = bytearray(data)
-    changed[byte] ^= 1 << bit
-    return bytes(changed)
 
 
 _FOREVER_NS = 2**65
