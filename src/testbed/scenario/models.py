@@ -16,6 +16,7 @@ from testbed.scenario.estimators import EstimatorSpec
 from testbed.scenario.events import ESTIMATOR_EVENTS, EstimatorEvent, Event, LinkEvent
 from testbed.scenario.inputs import ConstantInput, Input, TableInput, check_channels
 from testbed.scenario.links import AckLink, Links, SteppedImpairments
+from testbed.scenario.recovery import Recovery
 from testbed.scenario.services import Planned, planned
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Transport
@@ -70,6 +71,9 @@ class Scenario(Part):
     )
     links: Links = Field(default_factory=Links, description="The links between the parts.")
     transport: Transport = Field(default_factory=Transport, description="How the processes of a run talk.")
+    recovery: Recovery = Field(
+        default_factory=Recovery, description="What becomes of the run when one of its processes is lost."
+    )
     events: Annotated[tuple[Event, ...], Field(strict=False)] = Field(
         default=(), description="The timeline: what happens while the run goes."
     )
