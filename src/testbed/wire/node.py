@@ -84,6 +84,7 @@ class Node:
         self.stopped = False
         self.payload = b""
         """The message that is being handled."""
+        self.on_done: Callable[[int, int], None] = lambda step, lane: None
         self.leaving = ExitStack()
         """What is to be done when the role leaves."""
         self._tap = tap
@@ -260,6 +261,10 @@ class Node:
             return json.dumps({"error": f"kept from number {sent[0][0]} on, asked for {since}"}).encode()
         messages = [message for seq, message in sent if seq >= since]
         return bundle(messages) if messages else b""
+
+    def done(self, step: int, lane: int) -> None:
+        """A block of lanes has done a step, and sent everything of it."""
+        self.on_done(step, lane)
 
     def announce(self) -> None:
         """Say that this role is ready: all its subscriptions are declared."""
