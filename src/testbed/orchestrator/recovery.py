@@ -101,6 +101,8 @@ class Recovery:
         if policy == "fail" or self._restarts[role] >= allowed:
             return False
         self._restarts[role] += 1
+        for coming in self._coming.values():  # what the new process has not done itself must not be forgotten
+            coming.states.pop(role, None)
         record = Recovered(role=role, how=how, step=step, policy="restart", begin=self.begin(role, late=True).step)
         self.happened.append(record)
         self.down[role] = _Down(time.monotonic(), record)
@@ -126,13 +128,13 @@ class Recovery:
 
     def begin(self, role: str, *, late: bool) -> Begin:
         """Where a role begins now."""
-        states = self.checkpoint.states.get(role)
+        states, life = self.checkpoint.states.get(role), self._restarts[role]
         if states is not None:
-            return Begin(self.checkpoint.step, late, states)
+            return Begin(self.checkpoint.step, late, states, life=life)
         origin = self._origins.get(role)
         if origin is not None:
-            return Begin(origin.step, late, orders=tuple(origin.orders))
-        return Begin(0, late)
+            return Begin(origin.step, late, orders=tuple(origin.orders), life=life)
+        return Begin(0, late, life=life)
 
     def joined(self, role: RoleSpec, step: int, orders: list[tuple[Order, bytes]], policy: Policy) -> None:
         """An estimator's service begins after a step, as it was told."""
@@ -154,7 +156,7 @@ class Recovery:
             if given.role != role or given.lane not in self._blocks:
                 self.rejected["range"] += 1
                 continue
-            if given.step <= self.checkpoint.step:
+            if given.step <= self.checkpoint.step or given.life != self._restarts[role]:
                 continue
             coming = self._coming.setdefault(given.step, Checkpoint(given.step))
             coming.states.setdefault(role, {})[given.lane] = data

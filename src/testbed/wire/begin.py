@@ -23,6 +23,7 @@ class _Header(BaseModel):
     lanes: list[_Step]
     orders: list[Order]
     changes: _Step
+    life: _Step
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Begin:
 
     late: the run goes already, so that what was sent since is asked for. orders: what an estimator's service was told
     on its way, to be done again, with the bytes of a snapshot each. changes: orders to a link that are in the scenario.
+    life: how often the role was started before.
     """
 
     step: int = 0
@@ -38,6 +40,7 @@ class Begin:
     states: Mapping[int, bytes] = field(default_factory=dict)
     orders: tuple[tuple[Order, bytes], ...] = ()
     changes: int = 0
+    life: int = 0
 
     def to_bytes(self) -> bytes:
         header = _Header(
@@ -46,6 +49,7 @@ class Begin:
             lanes=list(self.states),
             orders=[order for order, _ in self.orders],
             changes=self.changes,
+            life=self.life,
         )
         return bundle([header.model_dump_json().encode(), *self.states.values(), *(data for _, data in self.orders)])
 
@@ -61,20 +65,24 @@ class Begin:
             raise UsageError("what the orchestrator says of the beginning is not whole")
         states = dict(zip(header.lanes, parts, strict=False))
         orders = zip(header.orders, parts[len(header.lanes) :], strict=True)
-        return cls(header.step, header.late, states, tuple(orders), header.changes)
+        return cls(header.step, header.late, states, tuple(orders), header.changes, header.life)
 
 
 AT_START = Begin()
 
 
 class Given(BaseModel):
-    """The header of a state: of a role's block of lanes, that begins at ``lane``, after ``step`` steps."""
+    """The header of a state: of a role's block of lanes, that begins at ``lane``, after ``step`` steps.
+
+    life: how often the role was started before.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     role: Annotated[str, Field(max_length=128)]
     step: _Step
     lane: _Step
+    life: _Step = 0
 
     def with_data(self, data: bytes) -> bytes:
         text = self.model_dump_json().encode()

@@ -84,7 +84,6 @@ class Node:
         self.stopped = False
         self.payload = b""
         """The message that is being handled."""
-        self.on_done: Callable[[int, int], None] = lambda step, lane: None
         self.leaving = ExitStack()
         """What is to be done when the role leaves."""
         self._tap = tap
@@ -217,7 +216,8 @@ class Node:
     def done(self, step: int, lane: int) -> None:
         """A block of lanes has done a step, and sent everything of it: give its state if it is time for that."""
         if self._every and not step % self._every and self._service is not _NO_SERVICE and self._give is not None:
-            self._give(Given(role=self.name, step=step, lane=lane).with_data(self._service.state(lane)))
+            given = Given(role=self.name, step=step, lane=lane, life=self.begin.life)
+            self._give(given.with_data(self._service.state(lane)))
 
     def catch_up(self) -> None:
         """Of a role that begins late: take what was sent before it listened, and then what has come since.
@@ -261,10 +261,6 @@ class Node:
             return json.dumps({"error": f"kept from number {sent[0][0]} on, asked for {since}"}).encode()
         messages = [message for seq, message in sent if seq >= since]
         return bundle(messages) if messages else b""
-
-    def done(self, step: int, lane: int) -> None:
-        """A block of lanes has done a step, and sent everything of it."""
-        self.on_done(step, lane)
 
     def announce(self) -> None:
         """Say that this role is ready: all its subscriptions are declared."""
