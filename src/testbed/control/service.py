@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any, get_args
 
 import numpy as np
@@ -77,7 +78,8 @@ class OpenLoopService:
 class ClosedLoopService:
     """u_k from x̂_k and P_k, in lock-step, within the limits; u_0 from the prior.
 
-    ``controllers`` hold all that the next step depends on, besides what is ready to be sent.
+    ``controllers`` hold all that the next step depends on, besides what is ready to be sent: more
+    than u_k where it begins late, and hears of the estimates before it hears of the clock.
     """
 
     def __init__(self, node: Node, setup: Setup, source: Following) -> None:
@@ -97,7 +99,7 @@ class ClosedLoopService:
         self._done = {lane: 0 for lane, _ in setup.blocks}
         self._send = node.sender(node.keys.sent("control"), Control, tap=True)
         self._granted = 0
-        self._ready: dict[int, tuple[int, Floats]] = {}
+        self._ready: dict[int, deque[tuple[int, Floats]]] = {lane: deque() for lane, _ in setup.blocks}
         for lane, lanes in setup.blocks:
             self._compute(0, lane, np.tile(model.x0_mean, (lanes, 1)), np.tile(model.P0, (lanes, 1, 1)))
         node.on(node.keys.clock, ClockMessage, ORCHESTRATOR, self._tick)
@@ -120,8 +122,8 @@ class ClosedLoopService:
         controller = self.controllers[lane]
         assert isinstance(controller, RestartableController)
         arrays = {f"controller.{name}": array for name, array in controller.state().items()}
-        if lane in self._ready:
-            arrays["ready"] = self._ready[lane][1]
+        if self._ready[lane]:
+            arrays["ready"] = self._ready[lane][-1][1]
         return arrays, {"version": controller.STATE_VERSION, "saturated": self._saturated[lane]}
 
     def resume(self, lane: int, step: int, state: bytes) -> None:
@@ -137,9 +139,9 @@ class ClosedLoopService:
             raise UsageError("the controller cannot go on: it lacks one of STATE_VERSION, state, set_state")
         given.expect(version=controller.STATE_VERSION)
         controller.set_state(given.group("controller."))
-        self._ready.pop(lane, None)
+        self._ready[lane].clear()
         if "ready" in given:
-            self._ready[lane] = step, given.array("ready", np.float64, self._lanes[lane], self._q)
+            self._ready[lane].append((step, given.array("ready", np.float64, self._lanes[lane], self._q)))
         self._saturated[lane], self._done[lane] = given.number("saturated"), step
 
     def _listen(self, node: Node, name: str) -> None:
@@ -168,14 +170,14 @@ class ClosedLoopService:
         if self._limits.given:
             u, saturated = self._limits.held(u)
             self._saturated[lane] += saturated
-        self._ready[lane] = (k, u)
+        self._ready[lane].append((k, u))
 
     def _tick(self, clock: ClockMessage, _: dict[str, NDArray[Any]]) -> None:
         self._granted = min(clock.step, self._steps)
         self._send_ready()
 
     def _send_ready(self) -> None:
-        for lane, (k, u) in list(self._ready.items()):
-            if k < self._granted:
-                del self._ready[lane]
+        for lane, ready in self._ready.items():
+            while ready and ready[0][0] < self._granted:
+                k, u = ready.popleft()
                 self._send(k, lane, len(u), {"u": u})

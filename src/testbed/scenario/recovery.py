@@ -62,7 +62,7 @@ class Recovery(Part):
     def _check_roles(cls, roles: dict[str, Policy]) -> dict[str, Policy]:
         for role, policy in roles.items():
             if policy == "continue" and not role.startswith(MAY_BE_MISSED):
-                raise problem(f"got 'continue'; allowed for {role}: restart, fail", f".{role}")
+                raise problem(f"got 'continue'; allowed for {role}: restart, fail", role)
         return roles
 
     @property
