@@ -134,9 +134,7 @@ class ClosedLoopService:
     def _resume(self, lane: int, step: int, given: Unpacked) -> None:
         controller = self.controllers[lane]
         if not isinstance(controller, RestartableController):
-            raise UsageError(
-                "the controller cannot go on: it lacks one of STATE_VERSION, state, set_state"
-            )
+            raise UsageError("the controller cannot go on: it lacks one of STATE_VERSION, state, set_state")
         given.expect(version=controller.STATE_VERSION)
         controller.set_state(given.group("controller."))
         self._ready.pop(lane, None)
