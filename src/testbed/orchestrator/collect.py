@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import json
 from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from testbed.errors import UsageError
 from testbed.numerics.lanes import Component, Matrix, Vector, matrix_of, vector_of
 from testbed.orchestrator.cost import CostBook
 from testbed.orchestrator.lane_windows import window_ends
 from testbed.orchestrator.lanes_file import LaneFigures
-from testbed.orchestrator.statistics import ERROR_FIGURES, LANE_FIGURES, Series, error_figures, prepare
+from testbed.orchestrator.statistics import ERROR_FIGURES, LANE_FIGURES, Arrays, Series, error_figures, prepare
 from testbed.wire.setup import Setup
 
-Arrays = dict[str, NDArray[Any]]
 TRUTH, BOUNDS = "truth", "bounds"
+
+
+class Figures(NamedTuple):
+    """What stays of the steps after + 1 … to."""
+
+    after: int
+    to: int
+    arrays: Arrays
 
 
 @dataclass
@@ -29,6 +39,7 @@ class _Step:
     gate: int
     come: list[tuple[int, str]] = field(default_factory=list)
     largest: float = 0.0
+    applied: int = 0
     truth: dict[int, Vector] = field(default_factory=dict)
     early: dict[int, list[tuple[str, Vector, Matrix]]] = field(default_factory=dict)
 
@@ -37,7 +48,7 @@ class Collector:
     """Knows which steps are complete, and the figures of those.
 
     completed: steps of which everything has come, in order. estimated: steps of which every estimate has come, which
-    is what lets the clock go on; truth and bounds may follow later.
+    is what lets the clock go on; truth and bounds may follow later. All sums are of completed steps.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -46,13 +57,17 @@ class Collector:
         self._first = {spec.name: 1 for spec in scenario.estimators}
         self._until = {spec.name: spec.until or scenario.steps for spec in scenario.estimators}
         self._words = {name: f"estimate of {name}" for name in self._until}
-        self._with_bounds = scenario.bounds
+        self._bounds_until = scenario.steps if scenario.bounds else 0
         self._count = scenario.steps
         self._windows = window_ends(scenario.steps, scenario.lanes, self._until.values())
         self.estimators = {spec.name: self._new_series() for spec in scenario.estimators}
         self.bounds = Series(("lower", "upper", "upper_correlated"), scenario.lanes)
         self.completed = 0
         self.estimated = 0
+        self.on_completed: Callable[[int], None] | None = None
+        """Called with each step when it is complete and the next one is not yet."""
+        self.discarded: Counter[str] = Counter()
+        """Lanes × steps that came of a part that was given up, after the last whole step of it."""
         self.largest_state: list[float] = []
         """The largest |x_k| of any lane and entry, at each completed step."""
         self.applied = 0
@@ -91,7 +106,7 @@ class Collector:
         x = record.truth[lane] = vector_of(arrays["x"])
         largest = max(map(abs, x)) if isinstance(x[0], float) else float(np.abs(arrays["x"]).max())
         record.largest = max(record.largest, largest)
-        self.applied += int(np.count_nonzero(arrays["nu"]))
+        record.applied += int(np.count_nonzero(arrays["nu"]))
         if self.cost is not None:
             self.cost.add(step, lane, x, arrays.get("applied"))
         for name, x_hat, P in record.early.pop(lane, ()):
@@ -99,6 +114,9 @@ class Collector:
         self._done(record, lane, TRUTH)
 
     def estimate(self, name: str, step: int, lane: int, arrays: Arrays) -> None:
+        if self.discarded and step > self._until[name]:
+            self.discarded[self._words[name]] += len(arrays["x_hat"])
+            return
         record = self._of(step)
         x_hat, P = vector_of(arrays["x_hat"]), matrix_of(arrays["P"])
         x = record.truth.get(lane)
@@ -110,12 +128,40 @@ class Collector:
         self._done(record, lane, self._words[name])
 
     def bound(self, step: int, lane: int, arrays: Arrays) -> None:
+        if step > self._bounds_until:
+            self.discarded[BOUNDS] += len(arrays["trace_lower"])
+            return
         figures = {"lower": _component(arrays["trace_lower"])}
         for name in ("upper", "upper_correlated"):
             if f"trace_{name}" in arrays:
                 figures[name] = _component(arrays[f"trace_{name}"])
         self.bounds.add(step, lane, figures)
         self._done(self._of(step), lane, BOUNDS)
+
+    def abandon(self, name: str) -> int:
+        """Go on without the estimates of a name: the last step of which all lanes have come, where its figures end.
+
+        What has come of later steps, or will, is discarded.
+        """
+        word = self._words[name]
+        last = self._until[name] = self._last_whole(word, self._first[name], self._until[name])
+        for record in self._strike(word, self.estimators[name], last):
+            record.gate -= len(self._blocks) - sum(part == word for _, part in record.come)
+            for lane, entries in record.early.items():
+                record.early[lane] = [entry for entry in entries if entry[0] != name]
+            record.come = [entry for entry in record.come if entry[1] != word]
+        self._plan()
+        self._advance()
+        return last
+
+    def abandon_bounds(self) -> int:
+        """Go on without bounds, as ``abandon`` does without an estimator."""
+        last = self._bounds_until = self._last_whole(BOUNDS, 1, self._bounds_until)
+        for record in self._strike(BOUNDS, self.bounds, last):
+            record.come = [entry for entry in record.come if entry[1] != BOUNDS]
+        self._plan()
+        self._advance()
+        return last
 
     def by_lane(self) -> LaneFigures:
         """The figures of each lane, over the windows of completed steps."""
@@ -140,7 +186,7 @@ class Collector:
     def _parts_at(self, step: int) -> tuple[frozenset[str], int]:
         """What a block of lanes has at a step, and how many of it are estimates."""
         names = {self._words[name] for name, until in self._until.items() if self._first[name] <= step <= until}
-        return frozenset(names | {TRUTH} | ({BOUNDS} if self._with_bounds else set())), len(names)
+        return frozenset(names | {TRUTH} | ({BOUNDS} if step <= self._bounds_until else set())), len(names)
 
     def _of(self, step: int) -> _Step:
         record = self._steps.get(step)
@@ -160,19 +206,25 @@ class Collector:
             self._series.append(self.cost)
         self._last_estimate = max(self._until.values(), default=0)
         begins = {first - 1 for first in self._first.values()}
-        self._ends = sorted({*self._until.values(), *begins, self._count})
+        self._ends = sorted({*self._until.values(), *begins, self._bounds_until, self._count})
         self._parts = [self._parts_at(end) for end in self._ends]
 
     def _done(self, record: _Step, lane: int, part: str) -> None:
         record.come.append((lane, part))
         record.outstanding -= 1
+        self._advance()
+
+    def _advance(self) -> None:
         steps = self._steps
         while (following := steps.get(self.completed + 1)) is not None and not following.outstanding:
             self.completed += 1
             del steps[self.completed]
             self.largest_state.append(following.largest)
+            self.applied += following.applied
             for series in self._series:
                 series.close(self.completed)
+            if self.on_completed is not None:
+                self.on_completed(self.completed)
         if self.estimated < self.completed:
             self.estimated = self.completed
         while (following := steps.get(self.estimated + 1)) is not None and self._estimated(following):
