@@ -54,6 +54,7 @@ class Node:
         self.stopped = False
         self.payload = b""
         """The message that is being handled."""
+        self.on_done: Callable[[int, int], None] = lambda step, lane: None
         self.leaving = ExitStack()
         """What is to be done when the role leaves."""
         self._tap = tap
@@ -141,6 +142,10 @@ class Node:
                 handler(header, arrays)
 
         self.bus.subscribe(key, receive)
+
+    def done(self, step: int, lane: int) -> None:
+        """A block of lanes has done a step, and sent everything of it."""
+        self.on_done(step, lane)
 
     def announce(self) -> None:
         """Say that this role is ready: all its subscriptions are declared."""
