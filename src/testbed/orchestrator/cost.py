@@ -67,7 +67,7 @@ class CostBook:
             self._sums[lane] = self._sums[lane] + cost if lane in self._sums else cost
 
     def state(self, step: int) -> Arrays:
-        """What outlives step ``step``, the last that is complete, beside the figures; sums (lanes,), if there are any."""
+        """What outlives the last complete step beside the figures: sums (lanes,), once there are any."""
         sums = [np.atleast_1d(self._sums[lane]) for lane in sorted(self._sums)]
         return {**self.series.state(step), **({"sums": np.concatenate(sums)} if sums else {})}
 

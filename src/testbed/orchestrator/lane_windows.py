@@ -45,15 +45,18 @@ class LaneWindows:
 
     def closed(self, after: int, to: int) -> Floats:
         """(W, F, lanes): sums of the windows whose last step is one of after + 1 … to."""
-        return self._sums[bisect_right(self.ends, after) : bisect_right(self.ends, to)]
+        sums: Floats = self._sums[bisect_right(self.ends, after) : bisect_right(self.ends, to)]
+        return sums
 
     def put_closed(self, after: int, to: int, sums: Floats) -> None:
-        """Have the sums that ``closed`` gave."""
-        self._sums[bisect_right(self.ends, after) : bisect_right(self.ends, to)] = sums
+        """Have the sums that ``closed`` gave, which may go further."""
+        begin, end = bisect_right(self.ends, after), bisect_right(self.ends, to)
+        self._sums[begin:end] = sums[: end - begin]
 
     def open_at(self, step: int) -> Floats:
         """(F, lanes): sums of the window that the step after ``step`` belongs to; may be written to."""
-        return self._sums[min(bisect_right(self.ends, step), len(self.ends) - 1)]
+        sums: Floats = self._sums[min(bisect_right(self.ends, step), len(self.ends) - 1)]
+        return sums
 
     def begin_at(self, first: int) -> None:
         """There are no values before step ``first``: the windows that begin before it have no mean."""

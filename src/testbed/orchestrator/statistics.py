@@ -123,7 +123,7 @@ class Series:
 
     def put_figures(self, after: int, to: int, arrays: Arrays) -> None:
         """Have what ``figures`` gave, which may go further, up to step ``to``, and nothing after it."""
-        closed, count = self._closed, max(0, to - after)
+        closed, count = self._closed, to - after
         del closed[after:]
         closed += [None] * (after - len(closed))
         for there, row in zip(arrays["there"][:count].tolist(), arrays["rows"][:count].tolist(), strict=True):
