@@ -29,6 +29,7 @@ from testbed.orchestrator.running import published
 from testbed.orchestrator.statistics import Progress
 from testbed.orchestrator.summary import Summary, Timing, write_summary
 from testbed.orchestrator.supervise import Supervisor, command_of
+from testbed.orchestrator.timeline import SNAPSHOTS
 from testbed.scenario import Scenario, to_toml
 from testbed.wire.memory_bus import MemoryNetwork
 from testbed.wire.node import ORCHESTRATOR, Node
@@ -170,6 +171,7 @@ class Run:
     def _conductor(self, bus: object, recorder: Recorder | None) -> Conductor:
         conductor = Conductor(bus, self._setup, [role.name for role in self._roles], recorder)  # type: ignore[arg-type]
         conductor.on_started, conductor.say = self._mark_start, self._say
+        conductor.timeline.folder = self._out / SNAPSHOTS
         return conductor
 
     def _mark_start(self) -> None:
@@ -260,7 +262,7 @@ class Run:
             window=self._setup.window,
             swaps=tuple(conductor.services.downtimes),
         )
-        conductor.services.give_up()
+        conductor.timeline.give_up()
         if conductor.stop_asked and not conductor.collector.finished:
             status = "interrupted"
             reason: str | None = "stopped by command"
