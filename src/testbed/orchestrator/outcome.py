@@ -317,9 +317,16 @@ def _controller(conductor: Conductor) -> ControllerFigures | None:
         kind=source.kind,
         estimator=source.estimator,
         gain=gain,
-        statement=statement(scenario),
+        statement=_statement(conductor),
         counters={name: n for name, n in counters.items() if not name.startswith("held")},  # those are in `realtime`
     )
+
+
+def _statement(conductor: Conductor) -> str | None:
+    said = statement(conductor.setup.scenario)
+    if said is None or drifts_from(conductor.happened) is None or not said.startswith("optimal"):
+        return said
+    return "not optimal: the plant drifts away from its model"
 
 
 def _cost(conductor: Conductor) -> CostFigures | None:
