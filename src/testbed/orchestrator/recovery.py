@@ -71,6 +71,8 @@ class Recovery:
         self.missed: Callable[[str, int], None] = lambda role, last: None
         self.forget: Callable[[int], None] = lambda step: None
         self.keep: Callable[[Checkpoint], bool] = lambda checkpoint: True
+        self.changes: Callable[[str], list[bytes]] = lambda role: []
+        """The changes that a role was told of."""
         self.happened: list[Recovered] = []
         self.down: dict[str, _Down] = {}
         self.checkpoint = Checkpoint(0)
@@ -128,13 +130,13 @@ class Recovery:
 
     def begin(self, role: str, *, late: bool) -> Begin:
         """Where a role begins now."""
-        states, life = self.checkpoint.states.get(role), self._restarts[role]
+        states, life, changes = self.checkpoint.states.get(role), self._restarts[role], tuple(self.changes(role))
         if states is not None:
-            return Begin(self.checkpoint.step, late, states, life=life)
+            return Begin(self.checkpoint.step, late, states, changes=changes, life=life)
         origin = self._origins.get(role)
         if origin is not None:
-            return Begin(origin.step, late, orders=tuple(origin.orders), life=life)
-        return Begin(0, late, life=life)
+            return Begin(origin.step, late, orders=tuple(origin.orders), changes=changes, life=life)
+        return Begin(0, late, changes=changes, life=life)
 
     def joined(self, role: RoleSpec, step: int, orders: list[tuple[Order, bytes]], policy: Policy) -> None:
         """An estimator's service begins after a step, as it was told."""

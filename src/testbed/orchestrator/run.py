@@ -25,16 +25,18 @@ from testbed.orchestrator.outcome import summarise
 from testbed.orchestrator.policies import policies_of
 from testbed.orchestrator.preflight import check_parts, check_processes, prepare_folder
 from testbed.orchestrator.priority import Priorities
+from testbed.orchestrator.processes import OneProcess, OwnProcesses
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.roles import RoleSpec, roles_of
 from testbed.orchestrator.running import published
 from testbed.orchestrator.statistics import Progress
 from testbed.orchestrator.summary import Summary, Timing, write_summary
 from testbed.orchestrator.supervise import Supervisor, command_of
+from testbed.orchestrator.timeline import SNAPSHOTS
 from testbed.scenario import Scenario, to_toml
 from testbed.scenario.recovery import Policy
 from testbed.wire.begin import Begin
-from testbed.wire.memory_bus import MemoryNetwork
+from testbed.wire.memory_bus import MemoryBus, MemoryNetwork
 from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.process import settle_memory
 from testbed.wire.setup import Role, Setup
@@ -111,6 +113,7 @@ class Run:
             conductor.services.launch = conductor.recovery.launch = launch
             conductor.services.drop, conductor.ending = supervisor.end, supervisor.ending_of
             conductor.watchdog.stopped = supervisor.stopped
+            conductor.timeline.processes = OwnProcesses(supervisor, bus, conductor.restart)
             bus.subscribe(conductor.node.keys.warm("*"), lambda _key, _payload: None)
             importing = threading.Thread(target=_import_report, daemon=True)
             importing.start()
@@ -167,6 +170,15 @@ class Run:
 
         conductor.services.launch = conductor.recovery.launch = launch
         conductor.services.drop = drop
+
+        def bus_of(role: str) -> MemoryBus:
+            for node, _ in nodes:
+                if node.name == role:
+                    assert isinstance(node.bus, MemoryBus)
+                    return node.bus
+            raise UsageError(f"{role}: no role of this run")
+
+        conductor.timeline.processes = OneProcess(bus_of, conductor.restart)
         with ExitStack() as cleanup:
             interrupts = cleanup.enter_context(noted())
             cleanup.enter_context(self._raised(conductor, dict))
@@ -191,6 +203,7 @@ class Run:
     def _conductor(self, bus: object, recorder: Recorder | None, policies: dict[str, Policy]) -> Conductor:
         conductor = Conductor(bus, self._setup, self._roles, recorder, policies)  # type: ignore[arg-type]
         conductor.on_started, conductor.say = self._mark_start, self._say
+        conductor.timeline.folder = self._out / SNAPSHOTS
         return conductor
 
     def _mark_start(self) -> None:
@@ -281,7 +294,7 @@ class Run:
             window=self._setup.window,
             swaps=tuple(conductor.services.downtimes),
         )
-        conductor.services.give_up()
+        conductor.timeline.give_up()
         if conductor.stop_asked and not conductor.collector.finished:
             status = "interrupted"
             reason: str | None = "stopped by command"

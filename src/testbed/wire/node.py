@@ -158,8 +158,8 @@ class Node:
         if is_packet:
             first = 0 if gate.passed_over == 0 else None
         elif self.begin.late:
-            first = self.begin.changes if model is Change else None
-        due = self._inputs[key] = _Input(key, first)
+            first = 0 if model is Change else None
+        due = self._inputs[key] = _Input(key, first, of_changes=model is Change)
         blocks = _blocks(self._tap, self.sizes) if cut else None
 
         def receive(payload: bytes) -> None:
@@ -207,7 +207,14 @@ class Node:
         self.bus.subscribe(key, hold if self._held is not None and is_packet and not cut else take)
 
     def serve(self, service: object) -> None:
-        """Say what service this is the node of; where it begins with a state, it is given that."""
+        """Say what service this is the node of; where it begins with a state, it is given that.
+
+        Before that it is told of the changes that were made.
+        """
+        for due in self._inputs.values():
+            if due.of_changes:
+                for message in self.begin.changes:
+                    due.receive(message)
         if getattr(service, "gives_state", False):
             self._service = service  # type: ignore[assignment]
             for lane, state in self.begin.states.items():
@@ -300,8 +307,8 @@ class Node:
 class _Input:
     """What is due on a key that a role listens to: the number of the next message, None until the first has come."""
 
-    def __init__(self, key: str, number: int | None) -> None:
-        self.key, self.number = key, number
+    def __init__(self, key: str, number: int | None, *, of_changes: bool) -> None:
+        self.key, self.number, self.of_changes = key, number, of_changes
         self.receive: Callable[[bytes], None] = lambda payload: None
 
 
