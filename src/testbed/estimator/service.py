@@ -17,9 +17,9 @@ from testbed.estimator.registry import create, model_of
 from testbed.numerics.lanes import Floats
 from testbed.scenario import EstimatorSpec, Scenario
 from testbed.wire.codec import all_finite
-from testbed.wire.handover import Order, answered
+from testbed.wire.handover import Behind, Order, answered
 from testbed.wire.messages import Acknowledgement, Control, EstimateMessage, Observation, Packet
-from testbed.wire.node import OPEN, Gate, Node
+from testbed.wire.node import OPEN, Gate, Node, Send
 from testbed.wire.setup import Setup
 from testbed.wire.state import pack, unpack
 
@@ -91,7 +91,14 @@ class EstimatorService:
             node.on(keys.sent("ack"), Acknowledgement, "plant", take_ack, needs=("nu",), gate=gate)
         elif acks == "link":
             node.on(keys.delivered("ack"), Acknowledgement, "link.ack", take_ack, needs=("mask",), gate=gate)
+        self._before: list[tuple[int, str, Send]] = []
+        """Under which name the estimates up to a step go, where those behind it go under another."""
         node.bus.answer(keys.handover(node.name), partial(answered, self._ordered))
+        for order, data in node.begin.orders:
+            if order.action == "take":
+                self._ordered(order, data)
+            elif order.name is not None:
+                self._serve(order.name, order.step)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -109,7 +116,8 @@ class EstimatorService:
         """A full snapshot, and the name under which the estimates go."""
         block = self._blocks[lane]
         snapshot = self._give(block, Order(action="give", step=block.done, form="full"))
-        return pack({"snapshot": _bytes(snapshot), "name": _bytes(self._name.encode())}, step=block.done)
+        name = self._way(block.done)[0]
+        return pack({"snapshot": _bytes(snapshot), "name": _bytes(name.encode())}, step=block.done)
 
     def resume(self, lane: int, step: int, state: bytes) -> None:
         """Raises UsageError for what is no state of this estimator after so many steps."""
@@ -122,13 +130,20 @@ class EstimatorService:
         block.done = done
         if self._gate is not OPEN:
             self._gate.passed_over = step
-        if name != self._name.encode():
+        if name != self._way(step)[0].encode():
             self._serve(name.decode(), step)
 
     def _serve(self, name: str, step: int) -> None:
         """Let the estimates of step + 1 and later go under a name."""
+        self._before.append((step, self._name, self._send))
         self._name = name
         self._send = self._node.sender(self._node.keys.estimate(name), EstimateMessage, gate=Gate(step))
+
+    def _way(self, step: int) -> tuple[str, Send]:
+        """The name of the estimates of a step, and how they are sent."""
+        if self._before and step <= self._before[-1][0]:
+            return next((name, send) for last, name, send in self._before if step <= last)
+        return self._name, self._send
 
     def _ordered(self, order: Order, data: bytes) -> bytes:
         """Do what the orchestrator asks at a step at which the clock stands still."""
@@ -138,10 +153,14 @@ class EstimatorService:
             if block is None:
                 raise UsageError(f"no block of lanes begins at {order.lane}")
             return self._give(block, order) if order.action == "give" else self._start(block, order, data)
+        if any(block.done < min(step, self._until) for block in self._blocks.values()):
+            raise Behind
         if any(block.done != min(step, self._until) for block in self._blocks.values()):
             raise UsageError(f"asked after step {step}, and is at another")
         if order.action == "leave":
             self._node.stopped = True
+        elif order.action == "ready":
+            return b""
         elif order.name is not None:
             self._serve(order.name, step)
         return b""
@@ -188,7 +207,7 @@ class EstimatorService:
         if estimate.error_bound is not None and estimate.error_bound_P is not None:
             arrays |= {"error_bound": estimate.error_bound, "error_bound_P": estimate.error_bound_P}
         block.done, block.latest = step, estimate
-        self._send(step, lane, block.lanes, arrays)
+        self._way(step)[1](step, lane, block.lanes, arrays)
         self._node.done(step, lane)
 
 

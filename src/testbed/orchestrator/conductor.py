@@ -114,6 +114,8 @@ class Conductor:
         self.recovery.forget = lambda step: self._order("forget", step)
         self.recovery.changes = lambda role: self.timeline.told_to(role.removeprefix("link."))
         self.recovery.missed, self.recovery.rejected = self._missed, self.node.rejected
+        self.services.retry, self.services.comes_back = self._advance_soon, self._comes_back
+        self.services.taken, self.services.served = self.recovery.taken, self.recovery.served
         self.ending: Callable[[str], str | None] = lambda role: None
         """How a role's process has ended, if it has."""
         self.watchdog = Watchdog(setup, self.collector, lambda: self._order("ping"))
@@ -349,6 +351,13 @@ class Conductor:
         name = role.decode(errors="replace")
         late = self.started and name in self.recovery.specs
         return (self.recovery.begin(name, late=True) if late else AT_START).to_bytes()
+
+    def _advance_soon(self) -> None:
+        self.activity += 1
+        self.node.bus.call(self._advance)
+
+    def _comes_back(self, role: str) -> bool:
+        return self.recovery.policy(role) == "restart"
 
     def _fails(self, role: str) -> bool:
         return self.recovery.policy(role) == "fail"

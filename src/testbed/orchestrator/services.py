@@ -22,8 +22,8 @@ from testbed.scenario import EstimatorSpec
 from testbed.scenario.estimator_events import EstimatorEvent
 from testbed.scenario.estimators import NewService
 from testbed.scenario.services import Planned
-from testbed.wire.bus import Bus
-from testbed.wire.handover import Order, ask
+from testbed.wire.bus import Bus, BusError
+from testbed.wire.handover import Behind, Order, ask
 from testbed.wire.keys import Keys
 from testbed.wire.setup import Setup
 
@@ -91,6 +91,14 @@ class Services:
         """Called with a role before it is launched, and the name of its estimates."""
         self.joins: Callable[[str, str, int], None] = lambda role, name, first: None
         self.leaves: Callable[[str], None] = lambda role: None
+        self.taken: Callable[[RoleSpec, EstimatorSpec, int, list[tuple[Order, bytes]]], None] = lambda *given: None
+        """Called with a service that begins after a step, and what it was told for that."""
+        self.retry: Callable[[], None] = lambda: None
+        """Called where a service is not there yet: let ``proceed`` be called once more, soon."""
+        self.comes_back: Callable[[str], bool] = lambda role: False
+        """Whether a role that does not answer will be started anew."""
+        self.served: Callable[[str, Order], None] = lambda role, order: None
+        """Called with a role and what it was told on its way."""
         self.failed: Callable[[str], None] = lambda reason: None
         self.unwanted: set[str] = set()
         """Roles that were started and are not needed any more; how they end is of no interest."""
@@ -207,11 +215,15 @@ class Services:
         plan, done, handed = entry.plan, entry.step - 1, 0
         try:
             self._check_still_there(plan)
+            if not self._are_ready(plan, done):
+                self.retry()
+                return
             if entry.role is not None:
-                handed = self._hand_over(plan, entry.role.name, done)
+                handed = self._hand_over(plan, entry.role, done)
             elif plan.promoted is not None:
                 order = Order(action="serve", step=done, name=plan.name)
                 ask(self._bus, self._key(self._serving(plan.promoted)), order)
+                self.served(self._serving(plan.promoted), order)
         except TestbedError as error:
             self._refuse(entry, str(error))
             return
@@ -224,9 +236,25 @@ class Services:
                 self.failed(f"{leaving} did not leave at step {entry.step}: {error}")
         self._settle(entry, entry.step, handed)
 
-    def _hand_over(self, plan: Planned, to: str, done: int) -> int:
+    def _are_ready(self, plan: Planned, done: int) -> bool:
+        """Whether the services that a change builds on are there; not while one is started anew."""
+        for name in (plan.source.name if plan.source is not None else None, plan.promoted):
+            if name is None:
+                continue
+            role = self._serving(name)
+            try:
+                ask(self._bus, self._key(role), Order(action="ready", step=done))
+            except Behind:
+                return False
+            except BusError:
+                if self.comes_back(role):
+                    return False
+                raise
+        return True
+
+    def _hand_over(self, plan: Planned, to: RoleSpec, done: int) -> int:
         """Block by block of lanes; the bytes that went over."""
-        form, handed = plan.handover or "cold", 0
+        form, told = plan.handover or "cold", list[tuple[Order, bytes]]()
         for lane, _ in self._setup.blocks:
             data = b""
             if form != "cold" and plan.source is not None:
@@ -235,9 +263,11 @@ class Services:
                     self._key(self._serving(plan.source.name)),
                     Order(action="give", step=done, lane=lane, form=form),
                 )
-            handed += len(data)
-            ask(self._bus, self._key(to), Order(action="take", step=done, lane=lane, form=form), data)
-        return handed
+            told.append((Order(action="take", step=done, lane=lane, form=form), data))
+            ask(self._bus, self._key(to.name), *told[-1])
+        assert plan.spec is not None
+        self.taken(to, plan.spec, done, told)
+        return sum(len(data) for _, data in told)
 
     def _settle(self, entry: _Pending, step: int, handed: int) -> None:
         """Everybody has agreed: whose estimates count from now on."""
