@@ -21,6 +21,7 @@ from testbed.wire.handover import Order, answered
 from testbed.wire.messages import Acknowledgement, Control, EstimateMessage, Observation, Packet
 from testbed.wire.node import OPEN, Gate, Node
 from testbed.wire.setup import Setup
+from testbed.wire.state import pack, unpack
 
 
 def role_of(name: str) -> str:
@@ -100,6 +101,35 @@ class EstimatorService:
                 total[key] = total.get(key, 0) + value
         return total
 
+    @property
+    def gives_state(self) -> bool:
+        return all(isinstance(block.estimator, Restartable) for block in self._blocks.values())
+
+    def state(self, lane: int) -> bytes:
+        """A full snapshot, and the name under which the estimates go."""
+        block = self._blocks[lane]
+        snapshot = self._give(block, Order(action="give", step=block.done, form="full"))
+        return pack({"snapshot": _bytes(snapshot), "name": _bytes(self._name.encode())}, step=block.done)
+
+    def resume(self, lane: int, step: int, state: bytes) -> None:
+        """Raises UsageError for what is no state of this estimator after so many steps."""
+        given, block = unpack(state), self._blocks[lane]
+        done = min(step, self._until)
+        given.expect(step=done)
+        snapshot, name = (given.array(part, np.uint8, None).tobytes() for part in ("snapshot", "name"))
+        given.end()
+        block.latest = start(block.refilter, "full", snapshot, model=self._model, lanes=block.lanes, step=done)
+        block.done = done
+        if self._gate is not OPEN:
+            self._gate.passed_over = step
+        if name != self._name.encode():
+            self._serve(name.decode(), step)
+
+    def _serve(self, name: str, step: int) -> None:
+        """Let the estimates of step + 1 and later go under a name."""
+        self._name = name
+        self._send = self._node.sender(self._node.keys.estimate(name), EstimateMessage, gate=Gate(step))
+
     def _ordered(self, order: Order, data: bytes) -> bytes:
         """Do what the orchestrator asks at a step at which the clock stands still."""
         step = order.step
@@ -113,8 +143,7 @@ class EstimatorService:
         if order.action == "leave":
             self._node.stopped = True
         elif order.name is not None:
-            key = self._node.keys.estimate(order.name)
-            self._name, self._send = order.name, self._node.sender(key, EstimateMessage, gate=Gate(step))
+            self._serve(order.name, step)
         return b""
 
     def _give(self, block: _Block, order: Order) -> bytes:
@@ -133,7 +162,11 @@ class EstimatorService:
 
     def _take(self, part: str, ahead: int, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         step = packet.step + ahead
-        if step > self._until or self._node.stopped:
+        if self._node.stopped:
+            return
+        if step > self._until:
+            if part == "y":
+                self._node.done(step, packet.lane)
             return
         whole = self._blocks[packet.lane].join(step, part, arrays)
         if whole is not None:
@@ -156,6 +189,7 @@ class EstimatorService:
             arrays |= {"error_bound": estimate.error_bound, "error_bound_P": estimate.error_bound_P}
         block.done, block.latest = step, estimate
         self._send(step, lane, block.lanes, arrays)
+        self._node.done(step, lane)
 
 
 def _acks(step: int, arrays: dict[str, NDArray[Any]] | None) -> tuple[Ack, ...]:
@@ -177,3 +211,7 @@ def _late_observations(arrays: dict[str, NDArray[Any]]) -> tuple[LateObservation
         return ()
     y, arrived = arrays["late_y"], arrays["late_mask"]
     return tuple(LateObservation(int(of), y[:, i], arrived[:, i]) for i, of in enumerate(arrays["late_step"][0]))
+
+
+def _bytes(data: bytes) -> NDArray[np.uint8]:
+    return np.frombuffer(data, dtype=np.uint8)

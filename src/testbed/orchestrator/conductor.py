@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal, cast, get_args
 
@@ -17,10 +17,15 @@ from testbed.estimator.bounds_service import ROLE as BOUNDS
 from testbed.orchestrator.collect import Collector
 from testbed.orchestrator.pacing import Pacing
 from testbed.orchestrator.recorder import Recorder
+from testbed.orchestrator.recovery import Recovery
+from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Services
 from testbed.orchestrator.summary import Happened
 from testbed.orchestrator.timeline import Timeline
+from testbed.orchestrator.watchdog import Watchdog
 from testbed.plant.service import ROLE as PLANT
+from testbed.scenario.recovery import Policy
+from testbed.wire.begin import AT_START
 from testbed.wire.bus import Bus
 from testbed.wire.codec import Rejected, encode
 from testbed.wire.keys import LinkName
@@ -36,7 +41,7 @@ from testbed.wire.messages import (
     Status,
     Truth,
 )
-from testbed.wire.node import OPEN, ORCHESTRATOR, Gate, Node
+from testbed.wire.node import OPEN, ORCHESTRATOR, Gate
 from testbed.wire.setup import Setup
 
 Arrays = dict[str, NDArray[Any]]
@@ -68,7 +73,15 @@ class Conductor:
     ``failure`` is the first reason the run cannot go on; ``reports`` the last word of each role.
     """
 
-    def __init__(self, bus: Bus, setup: Setup, roles: list[str], recorder: Recorder | None) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        setup: Setup,
+        roles: Sequence[RoleSpec],
+        recorder: Recorder | None,
+        policies: Mapping[str, Policy] | None = None,
+    ) -> None:
+        """policies: what becomes of a role that is lost; of one that is not among them, the run fails."""
         self.setup, self.collector = setup, Collector(setup)
         self.failure: str | None = None
         self.reports: dict[str, Status] = {}
@@ -78,7 +91,7 @@ class Conductor:
         """Grows with every message that was of use."""
         self.on_started: Callable[[], None] = lambda: None
         self.say: Callable[[str], None] = lambda line: None
-        self._roles = list(roles)
+        self._roles = [role.name for role in roles]
         self._present: set[str] = set()
         self._gone: list[str] = []
         """Roles that have left as they should."""
@@ -87,7 +100,8 @@ class Conductor:
         self._steps, self._credit = setup.scenario.steps, setup.credit
         self._stopping = False
         self._recorder = recorder
-        self.node = Node(bus, setup.run, ORCHESTRATOR, setup.sizes)
+        self.node = setup.join(bus, ORCHESTRATOR)
+        self._commands = 0
         self._command = bus.publisher(self.node.keys.command)
         self.pacing = Pacing(bus, setup, self.collector, self._grant, self.fail) if setup.real else None
         self.services = Services(bus, setup, self.collector, lambda line: self.say(line))
@@ -96,8 +110,16 @@ class Conductor:
         self._clock_seq = 0
         self.services.watch, self.services.joins = self._watch, self._joins
         self.services.leaves, self.services.failed = self._leaves, self.fail
+        self.recovery = Recovery(setup, self.collector, self.services, roles, dict(policies or {}))
+        self.recovery.forget = lambda step: self._order("forget", step)
+        self.recovery.changes = lambda role: self.timeline.told_to(role.removeprefix("link."))
+        self.recovery.missed, self.recovery.rejected = self._missed, self.node.rejected
+        self.ending: Callable[[str], str | None] = lambda role: None
+        """How a role's process has ended, if it has."""
+        self.watchdog = Watchdog(setup, self.collector, lambda: self._order("ping"))
         self._gates: dict[str, Gate] = {}
         self._subscribe()
+        bus.answer(self.node.keys.begin, self._begin_of)
         bus.answer(self.node.keys.ask, self._asked)
         bus.answer(self.node.keys.scenario, lambda _: setup.to_json())
         self.node.announce()
@@ -218,6 +240,11 @@ class Conductor:
 
     def tick(self, deadline_s: float) -> None:
         """From time to time: launch what will be needed, and give up what does not come."""
+        if self.started and not self.over:
+            self.recovery.proceed()
+            busy = bool(self.recovery.down) or self.timeline.held_at is not None
+            for role in self.watchdog.hung(self._present - {role for role in self._present if self._fails(role)}, busy):
+                self._is_lost(role, f"gave no sign of life for {self.watchdog.patience_s:g} s")
         if self.timeline.held_at is not None:
             self.activity += 1  # who holds the clock knows that nothing moves
         if self.timeline.pending and self.started and not self.over:
@@ -226,15 +253,22 @@ class Conductor:
             self._advance()
 
     def ended(self, role: str, how: str) -> None:
-        """A role's process has ended; fail unless it has reported, or was not in charge of anything yet."""
-        if role not in self.reports and role not in self._gone and not self._lost(role, f"{role} ended: {how}"):
-            self.fail(f"{role} ended: {how}")
+        """A role's process has ended; fail unless it has reported, can be recovered, or was not in charge yet."""
+        if role not in self.reports and role not in self._gone:
+            self.recovery.down.pop(role, None)
+            self._is_lost(role, f"ended: {how}")
+
+    def restart(self, role: str) -> None:
+        """Start a role anew. Raises UsageError where the scenario does not let that be."""
+        if self.recovery.policy(role) != "restart":
+            raise UsageError(f"{role} cannot be started anew: its policy of recovery is {self.recovery.policy(role)}")
+        self._is_lost(role, "was restarted")
 
     def stop(self) -> None:
         """Tell all roles to report and leave."""
         if not self._stopping:
             self._stopping = True
-            self._command(encode(Command(run=self.setup.run, source=ORCHESTRATOR, seq=0, action="stop")))
+            self._order("stop")
 
     @property
     def all_reported(self) -> bool:
@@ -244,7 +278,7 @@ class Conductor:
     def _subscribe(self) -> None:
         node, keys, scenario = self.node, self.node.keys, self.setup.scenario
         for role in self._roles:
-            node.on(keys.status(role), Status, role, partial(self._status, role))
+            self._listen(role)
         needs = ("applied",) if self.setup.costs_input else ()
         node.on(keys.truth, Truth, PLANT, self._truth, needs=needs)
         for spec in scenario.estimators:
@@ -280,7 +314,7 @@ class Conductor:
 
     def _watch(self, role: str, name: str) -> None:
         """Listen to a role that is about to be launched."""
-        self.node.on(self.node.keys.status(role), Status, role, partial(self._status, role))
+        self._listen(role)
         if name not in self.services.turns:
             self._gates[name] = Gate(None)
             self._take_estimates(name, self._gates[name])
@@ -304,6 +338,55 @@ class Conductor:
         self.activity += 1
         self._advance()
         return True
+
+    def _listen(self, role: str) -> None:
+        keys = self.node.keys
+        self.node.on(keys.status(role), Status, role, partial(self._status, role))
+        if self.setup.snapshot_every:
+            self.node.bus.subscribe(keys.state(role), lambda _, payload: self.recovery.take(role, payload))
+
+    def _begin_of(self, role: bytes) -> bytes:
+        name = role.decode(errors="replace")
+        late = self.started and name in self.recovery.specs
+        return (self.recovery.begin(name, late=True) if late else AT_START).to_bytes()
+
+    def _fails(self, role: str) -> bool:
+        return self.recovery.policy(role) == "fail"
+
+    def _is_lost(self, role: str, how: str) -> None:
+        """A role is not there any more, or does nothing: go on without it if that can be."""
+        if self._lost(role, f"{role} {how}"):
+            return
+        if self._stopping or not self.recovery.lost(role, how, started=self.started):
+            self.fail(f"{role} {how}{self.recovery.reason(role)}")
+            return
+        self._present.discard(role)
+        self.activity += 1
+        if role in self.recovery.down:
+            self.node.expect_anew(self.node.keys.status(role))
+        self.say(self.recovery.happened[-1].text)
+
+    def _missed(self, role: str, last: int) -> None:
+        """The run goes on without an estimator."""
+        self._leaves(role)
+        self.services.ended(role, last)
+        self._advance()
+
+    def _is_back(self, role: str) -> None:
+        """A role that was started anew is there: tell it what it has not heard."""
+        self.recovery.back(role)
+        self.timeline.tell_again(role.removeprefix("link."))
+        if self._granted:
+            self._grant(self._granted, None if self.pacing is None else self.pacing.times.start_ns)
+        if self._stopping:
+            self._order("stop")
+        elif self.started:
+            self._advance()
+
+    def _order(self, action: Literal["stop", "ping", "forget"], step: int | None = None) -> None:
+        command = Command(run=self.setup.run, source=ORCHESTRATOR, seq=self._commands, action=action, step=step)
+        self._commands += 1
+        self._command(encode(command))
 
     def _subscribe_for_recording(self) -> None:
         keys = self.node.keys
@@ -337,11 +420,14 @@ class Conductor:
             return
         if not alive:
             self._present.discard(role)
-            if not self._stopping:
-                self.fail(f"{role} is gone")
+            if not self._stopping and role not in self.recovery.down and role not in self.reports:
+                how = self.ending(role)
+                self._is_lost(role, "is gone" if how is None else f"ended: {how}")
             return
         self._present.add(role)
         self.activity += 1
+        if role in self.recovery.down:
+            self._is_back(role)
         if not self.missing and not self.started:
             self._begun = True
             self.on_started()
@@ -352,6 +438,9 @@ class Conductor:
                 self._advance()
 
     def _status(self, role: str, status: Status, _: Arrays) -> None:
+        if status.state == "alive":
+            self.watchdog.alive.add(role)
+            return
         self.reports[role] = status
         if status.state == "failed" and not self._lost(role, status.detail):
             self.fail(f"{role}: {status.detail}")
@@ -376,8 +465,10 @@ class Conductor:
     def _advance(self) -> None:
         """Grant the steps that may be in flight, several at a time, up to where estimators change.
 
-        In real time the clock does.
+        In real time the clock does. While a role is started anew nothing is granted or changed.
         """
+        if self.recovery.down:
+            return
         if self.pacing is not None:
             self.timeline.proceed_real(self._granted, self.collector.estimated)
             return

@@ -73,6 +73,9 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
     rejected = {role: dict(r.rejected) for role, r in sorted(conductor.reports.items()) if r.rejected}
     if conductor.node.rejected:
         rejected[ORCHESTRATOR] = dict(conductor.node.rejected)
+    repeated = {role: r.repeated for role, r in sorted(conductor.reports.items()) if r.repeated}
+    if conductor.node.repeated:
+        repeated[ORCHESTRATOR] = conductor.node.repeated
     broken = next((check.text for check in checks if check.name == "books" and not check.ok), None)
     return Summary.model_validate(
         {
@@ -89,8 +92,10 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
             "cost": _cost(conductor),
             "links": links,
             "events": with_transients(happened, scenario, conductor.services.turns, estimators),
+            "recovered": conductor.recovery.happened,
             "checks": checks,
             "rejected": rejected,
+            "repeated": repeated,
             "timing": timing,
             "realtime": realtime,
             "versions": versions(),

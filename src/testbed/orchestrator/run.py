@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,10 @@ from testbed.orchestrator.interrupts import Interrupts, noted
 from testbed.orchestrator.lanes_file import NAME as LANES
 from testbed.orchestrator.lanes_file import LaneFigures, write_lanes
 from testbed.orchestrator.outcome import summarise
+from testbed.orchestrator.policies import policies_of
 from testbed.orchestrator.preflight import check_parts, check_processes, prepare_folder
 from testbed.orchestrator.priority import Priorities
+from testbed.orchestrator.processes import OneProcess, OwnProcesses
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.roles import RoleSpec, roles_of
 from testbed.orchestrator.running import published
@@ -31,7 +34,9 @@ from testbed.orchestrator.summary import Summary, Timing, write_summary
 from testbed.orchestrator.supervise import Supervisor, command_of
 from testbed.orchestrator.timeline import SNAPSHOTS
 from testbed.scenario import Scenario, to_toml
-from testbed.wire.memory_bus import MemoryNetwork
+from testbed.scenario.recovery import Policy
+from testbed.wire.begin import Begin
+from testbed.wire.memory_bus import MemoryBus, MemoryNetwork
 from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.process import settle_memory
 from testbed.wire.setup import Role, Setup
@@ -83,6 +88,7 @@ class Run:
                 raise UsageError(
                     f"--external {name}: no such role; allowed: {', '.join(names)}{did_you_mean(name, names)}"
                 )
+        policies = policies_of(self._setup.scenario, self._roles, external)
         transport = self._setup.transport
         session, endpoint = open_router(transport)
         supervisor = Supervisor(self._out / "logs")
@@ -96,9 +102,18 @@ class Run:
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.express)
             bus.timed = self._setup.real
             cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
-            conductor = self._conductor(bus, recorder)
-            conductor.services.launch = lambda role: supervisor.start(role, endpoint, self._setup.run, transport)
-            conductor.services.drop = supervisor.end
+            conductor = self._conductor(bus, recorder, policies)
+
+            def launch(role: RoleSpec) -> None:
+                if role.name in external:
+                    self._say(f"start {role.name} by hand again: {shlex.join(self._by_hand(role, endpoint))}")
+                else:
+                    supervisor.start(role, endpoint, self._setup.run, transport)
+
+            conductor.services.launch = conductor.recovery.launch = launch
+            conductor.services.drop, conductor.ending = supervisor.end, supervisor.ending_of
+            conductor.watchdog.stopped = supervisor.stopped
+            conductor.timeline.processes = OwnProcesses(supervisor, bus, conductor.restart)
             bus.subscribe(conductor.node.keys.warm("*"), lambda _key, _payload: None)
             importing = threading.Thread(target=_import_report, daemon=True)
             importing.start()
@@ -123,15 +138,22 @@ class Run:
         Raises UsageError where a link needs real time and processes.
         """
         check_processes(self._setup.scenario)
+        self._setup = replace(self._setup, single=True)
+        policies = policies_of(self._setup.scenario, self._roles) if self._setup.snapshot_every else {}
         network = MemoryNetwork(schedule, timed=self._setup.real)
         recorder = self._recorder()
-        conductor = self._conductor(network.bus(), recorder)
+        conductor = self._conductor(network.bus(), recorder, policies)
         nodes: list[tuple[Node, Role]] = []
 
         def join(spec: RoleSpec) -> None:
-            node = Node(network.bus(), self._setup.run, spec.name, self._setup.sizes, self._setup.copied)
+            drop(spec.name)
+            bus = network.bus()
+            begin = Begin.from_bytes(bus.ask(conductor.node.keys.begin, spec.name.encode()))
+            node = self._setup.join(bus, spec.name, begin)
             nodes.append((node, spec.build(node, self._setup)))
+            node.serve(nodes[-1][1])
             node.announce()
+            node.catch_up()
 
         def launch(spec: RoleSpec) -> None:
             try:
@@ -146,7 +168,17 @@ class Run:
                 nodes.remove(entry)
                 entry[0].bus.close()
 
-        conductor.services.launch, conductor.services.drop = launch, drop
+        conductor.services.launch = conductor.recovery.launch = launch
+        conductor.services.drop = drop
+
+        def bus_of(role: str) -> MemoryBus:
+            for node, _ in nodes:
+                if node.name == role:
+                    assert isinstance(node.bus, MemoryBus)
+                    return node.bus
+            raise UsageError(f"{role}: no role of this run")
+
+        conductor.timeline.processes = OneProcess(bus_of, conductor.restart)
         with ExitStack() as cleanup:
             interrupts = cleanup.enter_context(noted())
             cleanup.enter_context(self._raised(conductor, dict))
@@ -168,8 +200,8 @@ class Run:
             _drain(network, lambda: conductor.all_reported)
             return self._finish(conductor, interrupted=interrupts.asked)
 
-    def _conductor(self, bus: object, recorder: Recorder | None) -> Conductor:
-        conductor = Conductor(bus, self._setup, [role.name for role in self._roles], recorder)  # type: ignore[arg-type]
+    def _conductor(self, bus: object, recorder: Recorder | None, policies: dict[str, Policy]) -> Conductor:
+        conductor = Conductor(bus, self._setup, self._roles, recorder, policies)  # type: ignore[arg-type]
         conductor.on_started, conductor.say = self._mark_start, self._say
         conductor.timeline.folder = self._out / SNAPSHOTS
         return conductor

@@ -157,6 +157,11 @@ class Services:
             self._refuse(entry, reason)
         return entry is not None
 
+    def ended(self, role: str, last: int) -> None:
+        """A service is lost, and its estimates end after a step."""
+        name = next(name for name, turns in self.turns.items() if turns[-1].role == role)
+        self.last[name] = min(self.last[name], last)
+
     def give_up(self) -> None:
         """The run is over: what has not happened will not."""
         for entry in list(self.pending):

@@ -299,6 +299,27 @@ class Downtime(_Model):
     ms: Number = Field(description="on the wall clock, from the last estimate before to the clock that goes on")
 
 
+class Recovered(_Model):
+    """A role that was lost, and what was done."""
+
+    role: str
+    how: str = Field(description="how it was lost")
+    step: NonNegativeInt = Field(description="the last step that was complete when that was noticed")
+    policy: Literal["restart", "continue"]
+    begin: NonNegativeInt = Field(
+        description="restart: the step of the snapshot from which it went on; continue: its last step"
+    )
+    down_ms: Number = Field(default=None, description="on the wall clock, until it was there again")
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        if self.policy == "continue":
+            return f"{self.role} {self.how}: the run went on without it from step {self.begin + 1} on"
+        took = "" if self.down_ms is None else f" within {self.down_ms:.0f} ms"
+        return f"{self.role} {self.how}: started anew from step {self.begin}{took}"
+
+
 class Timing(_Model):
     """How long the run took; seconds on the wall clock."""
 
@@ -327,9 +348,15 @@ class Summary(_Model):
     cost: CostFigures | None = Field(default=None, description="the quadratic cost; null: the scenario has no weights")
     links: dict[str, LinkFigures]
     events: tuple[Happened, ...] = Field(default=(), description="what changed while the run went, in order of time")
+    recovered: tuple[Recovered, ...] = Field(default=(), description="roles that were lost, in order of time")
     checks: tuple[Check, ...] = ()
     rejected: dict[str, dict[str, NonNegativeInt]] = Field(
         default_factory=dict, description="messages refused, by role and reason"
+    )
+    repeated: dict[str, NonNegativeInt] = Field(
+        default_factory=dict,
+        description="messages that had come before and were passed over, by role: a role that is started anew sends "
+        "again what it had sent since its snapshot",
     )
     timing: Timing = Timing()
     realtime: RealTime | None = Field(

@@ -198,6 +198,16 @@ class Timeline:
         self._ordered += 1
         return number
 
+    def told_to(self, part: str) -> list[bytes]:
+        """The changes that a part was told of, as they were sent."""
+        return [encode(change) for to, change in self.told if to == part]
+
+    def tell_again(self, part: str) -> None:
+        """Send them again, to who may not have heard some of them."""
+        if part in self._tell:
+            for message in self.told_to(part):
+                self._tell[part](message)
+
     def give_up(self) -> None:
         """The run is over: what has not happened will not."""
         self._services.give_up()

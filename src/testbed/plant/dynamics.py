@@ -28,6 +28,7 @@ from testbed.numerics.lanes import (
     where,
     where_vector,
 )
+from testbed.numerics.packed import Named
 from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.streams import Stream
 from testbed.numerics.symbols import Shape
@@ -137,6 +138,21 @@ class Plant:
         self._noise = v
         self._k += 1
         return array_of(self.x, self._lanes), array_of(y, self._lanes)
+
+    def state(self) -> dict[str, Floats]:
+        """All that the steps to come depend on, besides their number: x (M, n), and the input that is held (M, q)."""
+        held = {} if self._held is None else {"held": array_of(self._held, self._lanes)}
+        return {"x": array_of(self.x, self._lanes), **held}
+
+    def resume(self, step: int, state: Named) -> None:
+        """Go on after ``step`` steps from what ``state`` gave. Raises UsageError, and changes nothing, for another."""
+        m = self._matrices
+        x = vector_of(state.array("x", np.float64, self._lanes, len(m.a)))
+        if self._held is not None:
+            self._held = vector_of(state.array("held", np.float64, self._lanes, m.q))
+        self._k, self.x = step, x
+        if self._derivatives is not None:
+            self._epsilon = self._draw(step)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from testbed.wire.codec import all_finite
 from testbed.wire.messages import Acknowledgement, Change, Control, Observation, Truth
 from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.setup import Setup
+from testbed.wire.state import pack, unpack
 
 ROLE = "plant"
 
@@ -23,8 +24,8 @@ class PlantService:
 
     def __init__(self, node: Node, setup: Setup) -> None:
         keys = node.keys
+        self._node, self._done = node, {lane: 0 for lane, _ in setup.blocks}
         self._plants = {lane: Plant(setup.scenario, lane, lanes) for lane, lanes in setup.blocks}
-        self._next = dict.fromkeys(self._plants, 0)
         self._costs = setup.costs_input
         self._noise = setup.scenario.links.observation.on_loss == "noise"
         self._truth = node.sender(keys.truth, Truth, lazy=not setup.scenario.waits)
@@ -40,6 +41,21 @@ class PlantService:
         for plant in self._plants.values():
             plant.change(change.step, event)
 
+    @property
+    def gives_state(self) -> bool:
+        return True
+
+    def state(self, lane: int) -> bytes:
+        return pack(self._plants[lane].state(), step=self._done[lane])
+
+    def resume(self, lane: int, step: int, state: bytes) -> None:
+        """Raises UsageError for what is no state of this plant after so many steps."""
+        given = unpack(state)
+        given.expect(step=step)
+        self._plants[lane].resume(step, given)
+        given.end()
+        self._done[lane] = step
+
     def _move(self, packet: Control, arrays: dict[str, NDArray[Any]]) -> None:
         lane, lanes, step = packet.lane, packet.lanes, packet.step + 1
         applied = mask_of(arrays["mask"])
@@ -54,3 +70,5 @@ class PlantService:
         if self._costs:
             truth["applied"] = self._plants[lane].applied
         self._truth(step, lane, lanes, truth)
+        self._done[lane] = step
+        self._node.done(step, lane)

@@ -21,6 +21,7 @@ from testbed.scenario.link_timeline import changes_in
 from testbed.scenario.links import AckLink, Links, SteppedImpairments
 from testbed.scenario.moments import AnyEvent
 from testbed.scenario.plant_events import PlantEvent
+from testbed.scenario.recovery import Recovery
 from testbed.scenario.services import Planned, planned
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Transport
@@ -77,6 +78,9 @@ class Scenario(Part):
     )
     links: Links = Field(default_factory=Links, description="The links between the parts.")
     transport: Transport = Field(default_factory=Transport, description="How the processes of a run talk.")
+    recovery: Recovery = Field(
+        default_factory=Recovery, description="What becomes of the run when one of its processes is lost."
+    )
     events: Annotated[tuple[Event, ...], Field(strict=False)] = Field(
         default=(), description="The timeline: what happens while the run goes."
     )

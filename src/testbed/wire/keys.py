@@ -64,6 +64,19 @@ class Keys:
         """Ask an estimator's service here to give or take a state, to give the estimates of a name, or to leave."""
         return f"{self.prefix}/handover/{role}"
 
+    def history(self, key: str) -> str:
+        """Ask the sender on ``key`` here for what it has sent since a number."""
+        return f"{self.prefix}/history/{key[len(self.prefix) + 1 :]}"
+
+    @property
+    def begin(self) -> str:
+        """Ask the orchestrator here, with the name of a role, where it begins."""
+        return f"{self.prefix}/begin"
+
+    def state(self, role: str) -> str:
+        """Where a role gives its state now and then."""
+        return f"{self.prefix}/state/{role}"
+
     def status(self, role: str) -> str:
         return f"{self.prefix}/status/{role}"
 
