@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from orchestrator.commanding import commanded
 from orchestrator.runs import SYSTEM, figures, recorded, run, scenario
 from testbed.errors import UsageError
 from testbed.estimator import service
@@ -365,29 +366,6 @@ def test_what_builds_on_a_change_that_was_refused_is_refused(tmp_path: Path, mon
     assert [event.ok for event in summary.events] == [False, False, True]
     assert summary.events[1].reason == "there is no estimator 'next'"
     assert (summary.status, list(summary.estimators)) == ("complete", ["aoe"])
-
-
-class Commanding(Conductor):
-    """A conductor of which somebody asks something when so many steps are complete."""
-
-    asked: dict[int, dict[str, Any]]
-    answers: list[dict[str, Any]]
-
-    def _collected(self, *arguments: Any) -> None:
-        super()._collected(*arguments)
-        import json
-
-        question = self.asked.pop(self.collector.completed, None)
-        if question is not None:
-            self.answers.append(json.loads(self._asked(json.dumps(question).encode())))
-
-
-def commanded(folder: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[int, dict[str, Any]], **changes: Any) -> Any:
-    Commanding.asked, Commanding.answers = dict(asked), []
-    monkeypatch.setattr("testbed.orchestrator.run.Conductor", Commanding)
-    specs = [{"name": "aoe", "acks": "none"}, {"name": "ff", "acks": "none"}]
-    summary = run(scenario(estimators=specs, clock={"window": 2}, **changes), folder)
-    return summary, Commanding.answers
 
 
 def test_by_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,7 @@ def mark_events(figure: Figure, summary: Summary) -> None:
     panels = [axes for axes in figure.axes if axes.get_visible() and _along_steps(axes, summary)]
     for axes in panels:
         for step in {event.step for event in events}:
-            axes.axvline(step, color=GREY, linewidth=0.7, linestyle=(0, (1, 1)), zorder=0.5)
+            axes.axvline(step, color=GREY, linewidth=0.7, linestyle=(0, (1, 1)), zorder=1.6)
     if panels and len(events) <= LABELS_MAX:
         _label(panels[0], events)
 
