@@ -68,18 +68,22 @@ class Conductor:
         self.setup, self.collector = setup, Collector(setup)
         self.failure: str | None = None
         self.reports: dict[str, Status] = {}
-        self.stop_asked = False
-        """Somebody outside asked for the end."""
+        self.stop_asked = ""
+        """Why the run is to end before its end; empty: nobody asked for it."""
         self.activity = 0
         """Grows with every message that was of use."""
         self.on_started: Callable[[], None] = lambda: None
+        self.on_progress: Callable[[], None] = lambda: None
+        """Called when all roles are there, when steps are complete, and when events are decided."""
         self.say: Callable[[str], None] = lambda line: None
         self._roles = list(roles)
         self._present: set[str] = set()
         self._gone: list[str] = []
         """Roles that have left as they should."""
-        self._begun = False
+        self._begun = self._going = False
+        self._hold: int | None = None
         self._granted = 0
+        self._told = 0
         self._steps, self._credit = setup.scenario.steps, setup.credit
         self._stopping = False
         self._recorder = recorder
@@ -116,6 +120,16 @@ class Conductor:
         return self.collector.finished or self.failure is not None
 
     @property
+    def resting(self) -> bool:
+        """Whether everything is done up to the step at which the clock is held."""
+        return self._begun and self._hold is not None and self.collector.completed >= self._hold
+
+    @property
+    def held_at(self) -> int | None:
+        """The step beyond which the clock does not go, and that it has reached; None where it goes on."""
+        return self._granted if self._hold is not None and self._granted >= self._hold else None
+
+    @property
     def missing(self) -> list[str]:
         """Roles that are not there."""
         return [role for role in self._roles if role not in self._present]
@@ -131,7 +145,50 @@ class Conductor:
             return f"a service of {self.services.pending[0].plan.event.estimator} to join"
         return self.collector.awaiting() if self.started else f"roles to join: {', '.join(self.missing)}"
 
-    def change_link(self, link: str, change: dict[str, Any]) -> int:
+    def hold(self, step: int) -> None:
+        """Let the clock not go beyond a step. Raises UsageError where it is beyond that already.
+
+        In real time the clock can be held at the beginning only.
+        """
+        if self.pacing is not None and (step or self._going):
+            raise UsageError("the run keeps real time, which cannot be held; allowed: in virtual time")
+        if step < self._granted:
+            raise UsageError(f"step {step}: the clock is at step {self._granted}; allowed: {self._granted} or later")
+        self._hold = step
+        self._go()
+
+    def release(self) -> None:
+        """Let the clock go on."""
+        self._hold = None
+        self._go()
+
+    def outcome(self, number: int) -> Happened | None:
+        """What became of an order; None as long as that is to come."""
+        found = next((e for e in [*self.events, *self.services.happened] if e.number == number), None)
+        return found if found is not None and (not found.ok or found.step <= self._granted + 1) else None
+
+    def _go(self) -> None:
+        """Begin, unless the clock is held at the beginning, or go on."""
+        if not self._begun:
+            return
+        if not self._going and self._hold != 0:
+            self._going = True
+            self.on_started()
+            if self.pacing is not None:
+                self.pacing.begin()
+        self._advance()
+
+    def order(self, event: dict[str, Any]) -> int:
+        """Let an event happen, at its ``at`` or as soon as it can; its number. Raises UsageError where it cannot be."""
+        event = dict(event)
+        at = event.pop("at", None)
+        step = None if at is None else int(at)
+        if event.get("action") == "set":
+            self.change_link(str(event.get("link")), dict(event.get("set") or {}), step)
+            return self.events[-1].number or 0
+        return self.change_estimators(event, step)
+
+    def change_link(self, link: str, change: dict[str, Any], at: int | None = None) -> int:
         """Let keys of a link have other values from the next step on that is not granted yet; that step.
 
         Raises UsageError where that cannot be.
@@ -144,7 +201,9 @@ class Conductor:
             raise UsageError(f"link {link!r}: this run has none")
         if self.over or self._granted >= self._steps:
             raise UsageError("the run has no step left that could change")
-        event = Happened(step=self._granted + 1, by="command", link=link, set=change)
+        event = Happened(
+            step=max(at or 0, self._granted + 1), by="command", link=link, set=change, number=10**6 + len(self.events)
+        )
         events = sorted((e for e in [*self.events, event] if e.link == link), key=lambda e: e.step)
         after = in_turn(getattr(self.setup.scenario.links, link), [e.set or {} for e in events])
         check_link(self.setup.scenario, name, after[-1])
@@ -169,14 +228,14 @@ class Conductor:
             if asked.event is not None:
                 return json.dumps({"number": self.change_estimators(asked.event)}).encode()
             if asked.do == "stop":
-                self.stop_asked = True
+                self.end("stopped by command")
             if asked.do is not None:
                 return json.dumps(self.status()).encode()
             return json.dumps({"step": self.change_link(asked.link or "", asked.set or {})}).encode()
         except (UsageError, ValidationError) as error:
             return json.dumps({"error": " ".join(str(error).split())}).encode()
 
-    def change_estimators(self, event: dict[str, Any]) -> int:
+    def change_estimators(self, event: dict[str, Any], at: int | None = None) -> int:
         """Let an event of estimators, without ``at``, happen as soon as its service is there; its number.
 
         Raises UsageError where that cannot be.
@@ -189,15 +248,15 @@ class Conductor:
             )
         if self.over or self._granted >= self._steps:
             raise UsageError("the run has no step left that could change")
-        plan = plan_of(self.setup, self.services, event, self._granted + 1)
-        number = self.services.add(plan)
+        plan = plan_of(self.setup, self.services, event, max(at or 0, self._granted + 1))
+        number = self.services.add(plan, at)
         self._advance()
         return number
 
     def status(self) -> dict[str, Any]:
         """How far the run is, who estimates, and what has happened."""
         at = self._granted
-        roles = {name: self.services.role_at(name, at) for name in self.services.turns}
+        roles = {name: self.services.role_at(name, max(at, 1)) for name in self.services.turns}
         return {
             "completed": self.collector.completed,
             "granted": at,
@@ -228,11 +287,16 @@ class Conductor:
             if self.services.overdue(deadline_s):
                 self.activity += 1
             self._advance()
+            self.on_progress()
 
     def ended(self, role: str, how: str) -> None:
         """A role's process has ended; fail unless it has reported, or was not in charge of anything yet."""
         if role not in self.reports and role not in self._gone and not self._lost(role, f"{role} ended: {how}"):
             self.fail(f"{role} ended: {how}")
+
+    def end(self, reason: str) -> None:
+        """Somebody asks for the end before the end; the first reason stays."""
+        self.stop_asked = self.stop_asked or reason
 
     def stop(self) -> None:
         """Tell all roles to report and leave."""
@@ -293,6 +357,7 @@ class Conductor:
             return False
         self.activity += 1
         self._advance()
+        self.on_progress()
         return True
 
     def _subscribe_for_recording(self) -> None:
@@ -339,11 +404,8 @@ class Conductor:
         self.activity += 1
         if not self.missing and not self.started:
             self._begun = True
-            self.on_started()
-            if self.pacing is not None:
-                self.pacing.begin()
-            else:
-                self._advance()
+            self.on_progress()
+            self._go()
 
     def _status(self, role: str, status: Status, _: Arrays) -> None:
         self.reports[role] = status
@@ -365,6 +427,9 @@ class Conductor:
     def _collected(self, topic: str, packet: Packet, arrays: Arrays) -> None:
         self.activity += 1
         self._write(topic, packet, arrays)
+        if self.collector.completed != self._told:
+            self._told = self.collector.completed
+            self.on_progress()
         self._advance()
 
     def _advance(self) -> None:
@@ -379,9 +444,12 @@ class Conductor:
             self.services.pending and not self.over and self.services.proceed(self._granted, self.collector.estimated)
         ):
             self._grant_more()
+            self.on_progress()
 
     def _grant_more(self) -> None:
         steps, credit = self._steps, self._credit
+        if self._hold is not None:
+            steps = min(steps, self._hold)
         if self.services.pending:
             steps = self.services.limit(steps)
         target = min(steps, self.collector.estimated + credit)

@@ -17,6 +17,7 @@ import numpy as np
 from testbed.channel.real.check import check_links
 from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
 from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.desk import Desk
 from testbed.orchestrator.interrupts import Interrupts, noted
 from testbed.orchestrator.lanes_file import NAME as LANES
 from testbed.orchestrator.lanes_file import LaneFigures, write_lanes
@@ -66,6 +67,7 @@ class Run:
         self._begun_s = time.monotonic()
         self._started_s: float | None = None
         self._reported = 0
+        self.desk = Desk()
 
     @np.errstate(all="ignore")  # what is not finite has no figure, and is counted
     def over_zenoh(self, external: Sequence[str] = ()) -> Summary:
@@ -94,6 +96,7 @@ class Run:
             cleanup.callback(supervisor.close, 0.0)
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.express)
             bus.timed = self._setup.real
+            self.desk.wake = lambda: bus.call(self.desk.work)
             cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
             conductor = self._conductor(bus, recorder)
             conductor.services.launch = lambda role: supervisor.start(role, endpoint, self._setup.run, transport)
@@ -155,8 +158,12 @@ class Run:
                 for spec in self._roles:
                     join(spec)
                 while not conductor.over and not interrupts.asked and not conductor.stop_asked:
+                    self.desk.work()
                     if not network.step():
-                        conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
+                        if conductor.resting:
+                            self.desk.wait(_POLL_S)
+                        else:
+                            conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
                     self._tell(conductor)
             except TestbedError as error:
                 conductor.fail(str(error))
@@ -170,6 +177,7 @@ class Run:
     def _conductor(self, bus: object, recorder: Recorder | None) -> Conductor:
         conductor = Conductor(bus, self._setup, [role.name for role in self._roles], recorder)  # type: ignore[arg-type]
         conductor.on_started, conductor.say = self._mark_start, self._say
+        self.desk.open(conductor)
         return conductor
 
     def _mark_start(self) -> None:
@@ -218,11 +226,12 @@ class Run:
             if now - looked < _POLL_S:
                 continue
             looked = now
+            self.desk.work()
             self._tell(conductor)
             for role, ending in supervisor.dead().items():
                 conductor.ended(role, f"{ending}{_last_words(supervisor.log_of(role))}")
             conductor.tick(deadline_s)
-            if conductor.activity != last:
+            if conductor.activity != last or conductor.resting:
                 last, since = conductor.activity, now
             elif now - since > deadline_s and not (patient and not conductor.started):
                 conductor.fail(f"no progress for {deadline_s:g} s; waiting for {conductor.awaiting()}")
@@ -263,7 +272,7 @@ class Run:
         conductor.services.give_up()
         if conductor.stop_asked and not conductor.collector.finished:
             status = "interrupted"
-            reason: str | None = "stopped by command"
+            reason: str | None = conductor.stop_asked
         elif interrupted and not conductor.collector.finished:
             status, reason = "interrupted", "interrupted by the user"
         elif conductor.failure is not None:

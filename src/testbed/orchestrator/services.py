@@ -99,9 +99,9 @@ class Services:
         """The last step that the clock may grant now."""
         return min([steps, *(p.step - 1 for p in self.pending if p.step is not None)])
 
-    def add(self, plan: Planned) -> int:
+    def add(self, plan: Planned, step: int | None = None) -> int:
         """A change that somebody asks for: as soon as its service is there. Its number among those of the run."""
-        entry = _Pending(plan, "command", None, number=self.number)
+        entry = _Pending(plan, "command", step, number=self.number)
         self.pending.append(entry)
         return entry.number
 
