@@ -428,9 +428,13 @@ def test_a_run_is_stopped_by_command(tmp_path: Path, monkeypatch: pytest.MonkeyP
     [
         ({"action": "swap", "estimator": "aeo", "to": {"kind": "ff"}}, "got 'aeo'; allowed at step"),
         ({"action": "swap", "estimator": "aoe", "to": {"kind": "fff"}}, "unknown estimator 'fff'; allowed: aoe"),
-        ({"action": "swop", "estimator": "aoe"}, "action: got 'swop'; allowed: swap, add, shadow, remove; did you"),
+        ({"action": "swop", "estimator": "aoe"}, "action: got 'swop'; allowed: set, swap, add, shadow, remove, acks,"),
         ({"action": "swap", "estimator": "aoe", "to": {"kind": "ff"}, "handover": "full"}, "which do not share the"),
-        ({"action": "set", "link": "control", "set": {}}, "action: got 'set'; allowed: swap, add, shadow, remove"),
+        ({"action": "set", "link": "control", "set": {}}, "set: got a table; allowed: a table with keys of the link"),
+        ({"action": "mark", "name": "x", "at": 2}, "at: got 2; allowed: "),
+        ({"action": "heal"}, "got all, and none is cut then; allowed: none"),
+        ({"action": "kill", "role": "plnt"}, "role: got 'plnt'; allowed: controller, plant, link.control, "),
+        ({"action": "mark", "name": "x", "when": "loss_rate(control) > 0"}, "when: got loss_rate(control); allowed: "),
         ({"action": "add", "estimator": "aoe", "to": {"kind": "ff"}}, "got 'aoe' a second time; allowed: a name of"),
     ],
 )

@@ -108,7 +108,7 @@ class LinkService:
         size = packet_bytes(scenario, link)
         self._timed = {lane: timed_block(scenario, link, lane, lanes, size) for lane, lanes in setup.blocks if timed}
         self._keeps_late = link != "control"
-        self._counts = LossCounts()
+        self._counts, self._cut = LossCounts(), 0
         self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
         noise = link == "observation" and scenario.links.observation.on_loss == "noise"
         self._instead = "noise" if noise else None
@@ -121,7 +121,11 @@ class LinkService:
 
     @property
     def counters(self) -> dict[str, int]:
-        return timed_counters(list(self._timed.values()), self._keeps_late) or self._counts.as_counters()
+        if self._timed:
+            return timed_counters(list(self._timed.values()), self._keeps_late)
+        counters = self._counts.as_counters()
+        causes = {"dropped_cut": self._cut, "dropped_loss": counters["dropped"] - self._cut} if self._cut else {}
+        return {**counters, **causes}
 
     def _note(self, change: Change, _: dict[str, NDArray[Any]]) -> None:
         """Take an order to change from a step on that is still to come; the orchestrator has checked it."""
@@ -147,6 +151,9 @@ class LinkService:
         if self._changes:
             self._change(lane, packet.lanes, packet.step)
         arrived = self._losses[lane].next(packet.step - self._first_step)
+        if not self._now[lane][1].up:
+            self._cut += int(np.count_nonzero(arrived))
+            arrived = False if isinstance(arrived, bool) else np.zeros_like(arrived)
         self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
         self._counts.count(lane, arrived)
 

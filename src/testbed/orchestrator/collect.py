@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +14,7 @@ from testbed.numerics.lanes import Component, Matrix, Vector, matrix_of, vector_
 from testbed.orchestrator.cost import CostBook
 from testbed.orchestrator.lane_windows import window_ends
 from testbed.orchestrator.lanes_file import LaneFigures
-from testbed.orchestrator.statistics import ERROR_FIGURES, LANE_FIGURES, Series, error_figures, prepare
+from testbed.orchestrator.statistics import ERROR_FIGURES, LANE_FIGURES, Figures, Series, error_figures, prepare
 from testbed.wire.setup import Setup
 
 Arrays = dict[str, NDArray[Any]]
@@ -64,6 +65,8 @@ class Collector:
         )
         self._plan()
         self._steps: dict[int, _Step] = {}
+        self.watch: Callable[[str, int, int, Figures], None] = lambda name, step, lane, figures: None
+        """Called with the figures of each estimator, step and block of lanes, as they come."""
 
     def prepare(self) -> None:
         """What would hold up the first step: make it now."""
@@ -132,7 +135,9 @@ class Collector:
         return f"step {self.completed + 1}: {', '.join(sorted(awaited))}"
 
     def _reduce(self, name: str, step: int, lane: int, x: Vector, x_hat: Vector, P: Matrix) -> None:
-        self.estimators[name].add(step, lane, error_figures(x, x_hat, P))
+        figures = error_figures(x, x_hat, P)
+        self.estimators[name].add(step, lane, figures)
+        self.watch(name, step, lane, figures)
 
     def _new_series(self) -> Series:
         return Series(ERROR_FIGURES, self._setup.scenario.lanes, kept=len(LANE_FIGURES), ends=self._windows)

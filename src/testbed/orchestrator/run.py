@@ -30,6 +30,7 @@ from testbed.orchestrator.running import published
 from testbed.orchestrator.statistics import Progress
 from testbed.orchestrator.summary import Summary, Timing, write_summary
 from testbed.orchestrator.supervise import Supervisor, command_of
+from testbed.orchestrator.timeline import SNAPSHOTS
 from testbed.scenario import Scenario, to_toml
 from testbed.wire.memory_bus import MemoryNetwork
 from testbed.wire.node import ORCHESTRATOR, Node
@@ -177,6 +178,7 @@ class Run:
     def _conductor(self, bus: object, recorder: Recorder | None) -> Conductor:
         conductor = Conductor(bus, self._setup, [role.name for role in self._roles], recorder)  # type: ignore[arg-type]
         conductor.on_started, conductor.say = self._mark_start, self._say
+        conductor.timeline.folder = self._out / SNAPSHOTS
         self.desk.open(conductor)
         return conductor
 
@@ -231,7 +233,7 @@ class Run:
             for role, ending in supervisor.dead().items():
                 conductor.ended(role, f"{ending}{_last_words(supervisor.log_of(role))}")
             conductor.tick(deadline_s)
-            if conductor.activity != last or conductor.resting:
+            if conductor.activity != last:
                 last, since = conductor.activity, now
             elif now - since > deadline_s and not (patient and not conductor.started):
                 conductor.fail(f"no progress for {deadline_s:g} s; waiting for {conductor.awaiting()}")
@@ -269,7 +271,7 @@ class Run:
             window=self._setup.window,
             swaps=tuple(conductor.services.downtimes),
         )
-        conductor.services.give_up()
+        conductor.timeline.give_up()
         if conductor.stop_asked and not conductor.collector.finished:
             status = "interrupted"
             reason: str | None = conductor.stop_asked

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from testbed.errors import RunFailed, TestbedError, UsageError
@@ -19,8 +19,8 @@ from testbed.orchestrator.collect import Collector
 from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.summary import Downtime, Happened
 from testbed.scenario import EstimatorSpec
+from testbed.scenario.estimator_events import EstimatorEvent
 from testbed.scenario.estimators import NewService
-from testbed.scenario.events import EstimatorEvent
 from testbed.scenario.services import Planned
 from testbed.wire.bus import Bus
 from testbed.wire.handover import Order, ask
@@ -41,18 +41,27 @@ class Turn:
     carried: bool = False
 
 
+@dataclass(frozen=True)
+class Origin:
+    """Who asked for an event, its number, and for which condition it waited, since when that held."""
+
+    by: Literal["timeline", "command", "condition"]
+    number: int
+    when: str | None = None
+    true_at: int | None = None
+
+
 @dataclass
 class _Pending:
     """A change that is not decided yet. step: None until the service that somebody asked for is there."""
 
     plan: Planned
-    by: Literal["timeline", "command"]
+    origin: Origin
     step: int | None
     role: RoleSpec | None = None
     launched_s: float | None = None
     held_s: float | None = None
     present: bool = False
-    number: int = 0
 
 
 class Services:
@@ -71,7 +80,7 @@ class Services:
         }
         self.last: dict[str, int] = {spec.name: spec.until or scenario.steps for spec in scenario.estimators}
         """The last step at which a name has estimates."""
-        self.pending = [_Pending(plan, "timeline", plan.step, number=i) for i, plan in enumerate(scenario.swaps)]
+        self.pending = [_Pending(plan, Origin("timeline", plan.place), plan.step) for plan in scenario.swaps]
         self.happened: list[Happened] = []
         self.downtimes: list[Downtime] = []
         self.launch: Callable[[RoleSpec], None] = _nobody
@@ -99,16 +108,14 @@ class Services:
         """The last step that the clock may grant now."""
         return min([steps, *(p.step - 1 for p in self.pending if p.step is not None)])
 
-    def add(self, plan: Planned, step: int | None = None) -> int:
-        """A change that somebody asks for: as soon as its service is there. Its number among those of the run."""
-        entry = _Pending(plan, "command", step, number=self.number)
-        self.pending.append(entry)
-        return entry.number
+    def add(self, plans: list[Planned], origin: Origin, step: int | None) -> None:
+        """Changes that somebody asks for: at a step that is not granted; None: as soon as their services are there."""
+        self.pending += [_Pending(plan, origin, step) for plan in plans]
 
     @property
-    def number(self) -> int:
-        """Of the next change that somebody asks for."""
-        return len(self.pending) + len(self.happened)
+    def numbers(self) -> set[int]:
+        """Of the events that are not decided yet."""
+        return {entry.origin.number for entry in self.pending if entry.origin.by != "timeline"}
 
     def proceed(self, granted: int, estimated: int) -> bool:
         """Launch what is due, and make the changes for which everything is there; whether any was decided."""
@@ -153,7 +160,7 @@ class Services:
     def give_up(self) -> None:
         """The run is over: what has not happened will not."""
         for entry in list(self.pending):
-            if entry.by == "command":
+            if entry.origin.by != "timeline":
                 self._refuse(entry, "the run was over before")
 
     def _of(self, role: str) -> _Pending | None:
@@ -198,12 +205,12 @@ class Services:
             if entry.role is not None:
                 handed = self._hand_over(plan, entry.role.name, done)
             elif plan.promoted is not None:
-                order = Order(action="serve", step=done, name=plan.event.estimator)
+                order = Order(action="serve", step=done, name=plan.name)
                 ask(self._bus, self._key(self._serving(plan.promoted)), order)
         except TestbedError as error:
             self._refuse(entry, str(error))
             return
-        if plan.source is not None and plan.event.action in ("swap", "remove"):
+        if plan.source is not None and (plan.replaces or plan.spec is None):
             leaving = self._serving(plan.source.name)
             self.leaves(leaving)
             try:
@@ -240,7 +247,7 @@ class Services:
             self._end(plan.source.name, step - 1)
         else:
             name = plan.spec.name
-            carried = plan.handover == "full" and plan.event.action == "swap"
+            carried = plan.handover == "full" and plan.replaces
             self.turns.setdefault(name, []).append(Turn(step, role, plan.spec, carried))
             self.last[name] = plan.spec.until or steps
             self._collector.expect(name, step, self.last[name])
@@ -251,7 +258,18 @@ class Services:
         self.happened.append(_happened(entry, step).model_copy(update={"bytes": handed}))
         if entry.held_s is not None:
             waited = 1e3 * (time.monotonic() - entry.held_s)
-            self.downtimes.append(Downtime(step=step, estimator=plan.event.estimator, ms=waited))
+            self.downtimes.append(Downtime(step=step, estimator=plan.name, ms=waited))
+
+    def state_of(self, name: str, done: int) -> list[bytes]:
+        """The whole state of an estimator after so many steps, a snapshot for each block of lanes.
+
+        Raises a TestbedError where it does not run, or has none to give.
+        """
+        role = self.role_at(name, done + 1)
+        if role is None:
+            raise UsageError(f"there is no estimator {name!r}")
+        orders = [Order(action="give", step=done, lane=lane, form="full") for lane, _ in self._setup.blocks]
+        return [ask(self._bus, self._key(role), order) for order in orders]
 
     def _end(self, name: str, last: int) -> None:
         self.last[name] = min(self.last[name], last)
@@ -285,13 +303,13 @@ def _happened(entry: _Pending, step: int) -> Happened:
     to = getattr(event, "to", None)
     return Happened(
         step=step,
-        by=entry.by,
-        number=entry.number,
+        **asdict(entry.origin),
         action=event.action,
-        estimator=event.estimator,
+        estimator=event.estimator or entry.plan.name,
         name=getattr(event, "name", None),
         to=to if to is None or isinstance(to, str) else _table(to),
         handover=entry.plan.handover,
+        acks=getattr(event, "acks", None),
     )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 SHOWN_MAX = 60
@@ -26,7 +27,13 @@ class Part(BaseModel):
     @classmethod
     def known_keys(cls) -> list[str]:
         """The keys allowed in the table of this part."""
-        return [*cls.model_fields, *cls.other_keys]
+        return [*(field.alias or name for name, field in cls.model_fields.items()), *cls.other_keys]
+
+    @classmethod
+    def field_of(cls, key: str) -> FieldInfo | None:
+        """The field of a key of the table."""
+        fields = cls.model_fields
+        return fields.get(key) or next((field for field in fields.values() if field.alias == key), None)
 
 
 def problem(text: str, at: str = "") -> PydanticCustomError:

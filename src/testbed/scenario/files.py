@@ -19,6 +19,9 @@ def resolve_files(tables: dict[str, Any], base_dir: Path) -> dict[str, Any]:
     source = result.get("input")
     if isinstance(source, dict) and source.get("kind") == "table":
         result["input"] = _with_values("input", source, base_dir)
+    events = result.get("events")
+    if isinstance(events, list | tuple):
+        result["events"] = [_read_event(f"events[{i}]", event, base_dir) for i, event in enumerate(events)]
     if isinstance(result.get("links"), dict):
         result["links"] = {
             name: _read_link(name, link, base_dir) if isinstance(link, dict) else link
@@ -31,6 +34,13 @@ def resolve_files(tables: dict[str, Any], base_dir: Path) -> dict[str, Any]:
             transport["tls"] = _absolute(transport["tls"], _TLS_FILES, base_dir)
         result["transport"] = transport
     return result
+
+
+def _read_event(where: str, event: Any, base_dir: Path) -> Any:
+    source = event.get("input") if isinstance(event, dict) else None
+    if not isinstance(source, dict) or source.get("kind") != "table":
+        return event
+    return {**event, "input": _with_values(f"{where}.input", source, base_dir)}
 
 
 def _absolute(table: dict[str, Any], keys: tuple[str, ...], base_dir: Path) -> dict[str, Any]:

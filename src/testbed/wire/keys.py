@@ -48,9 +48,9 @@ class Keys:
         """Where the recorded lanes of what goes over ``key`` are copied to."""
         return f"{self.prefix}/tap/{key[len(self.prefix) + 1 :]}"
 
-    def change(self, link: LinkName) -> str:
-        """Where the orchestrator tells a link of a change."""
-        return f"{self.prefix}/{link}/change"
+    def change(self, part: str) -> str:
+        """Where the orchestrator tells a link, the plant or the controller of a change."""
+        return f"{self.prefix}/{part}/change"
 
     @property
     def ask(self) -> str:

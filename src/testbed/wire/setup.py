@@ -10,6 +10,9 @@ from typing import Protocol
 
 from testbed.scenario import ClosedLoop, Scenario, Transport, parse_scenario, to_toml
 from testbed.scenario.backend import real_links
+from testbed.scenario.estimator_events import AcksEvent
+from testbed.scenario.estimators import NewService
+from testbed.scenario.events import Event
 from testbed.wire.codec import Sizes
 from testbed.wire.node import Node
 
@@ -132,6 +135,7 @@ class Setup:
         s = self.scenario
         specs = [*s.estimators, *(planned.spec for planned in s.swaps)]
         told = any(spec is not None and spec.acks == "perfect" for spec in specs)
+        told = told or any(_asks_for_acks(event) for event in s.events if not event.timed)
         return s.links.ack.mode != "none" or s.record != "none" or told
 
     @property
@@ -146,6 +150,14 @@ class Setup:
     def from_json(cls, payload: bytes) -> Setup:
         data = json.loads(payload)
         return cls(data["run"], parse_scenario(data["scenario"]))
+
+
+def _asks_for_acks(event: Event) -> bool:
+    """Whether an estimator may be told of every control packet after an event that waits."""
+    if isinstance(event, AcksEvent):
+        return event.acks == "perfect"
+    to = getattr(event, "to", None)
+    return isinstance(to, NewService) and to.acks == "perfect"
 
 
 class Role(Protocol):

@@ -41,6 +41,46 @@ class Actions(ABC):
         """Let keys of a link have other values, such as ``loss={"arrival": 0.3}``."""
         return self.do("set", link=link, set=keys)
 
+    def acks(self, acks: str, estimator: str | None = None) -> Ordered:
+        """Switch the ACKs of an estimator, or of all that run: none, perfect or link."""
+        return self.do("acks", acks=acks, estimator=estimator)
+
+    def input(self, **table: Any) -> Ordered:
+        """Another open-loop input: its table, such as ``kind="constant", value=[1.0]``."""
+        return self.do("input", input=table)
+
+    def plant(self, *, over: int | None = None, **parameters: Any) -> Ordered:
+        """Give the plant other parameters, A, B, C, Q, R, G, in a straight line ``over`` so many steps."""
+        return self.do("plant", over=over, **parameters)
+
+    def partition(self, *links: str) -> Ordered:
+        """Let nothing through some links; none named: all of the run."""
+        return self.do("partition", links=list(links) or None)
+
+    def heal(self, *links: str) -> Ordered:
+        """Make links whole again; none named: all that are cut."""
+        return self.do("heal", links=list(links) or None)
+
+    def mark(self, name: str) -> Ordered:
+        """A mark in the results; it changes nothing."""
+        return self.do("mark", name=name)
+
+    def snapshot(self, estimator: str, name: str | None = None) -> Ordered:
+        """Write the state of an estimator down."""
+        return self.do("snapshot", estimator=estimator, name=name)
+
+    def kill(self, role: str) -> Ordered:
+        """Kill a process by its role, such as "plant" or "estimator.aoe"."""
+        return self.do("kill", role=role)
+
+    def pause(self, role: str, lasts: str) -> Ordered:
+        """Stop a process, and continue it after a duration such as "200 ms"."""
+        return self.do("pause", role=role, **{"for": lasts})
+
+    def restart(self, role: str) -> Ordered:
+        """End a process and start it anew."""
+        return self.do("restart", role=role)
+
 
 class Moment(Actions):
     """Orders for one step, time or condition: ``moment`` is the key that says which."""

@@ -6,6 +6,7 @@ import atexit
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +24,7 @@ from testbed.orchestrator.preflight import default_folder
 from testbed.orchestrator.run import Run
 from testbed.orchestrator.summary import Happened, Summary
 from testbed.scenario import Scenario
-from testbed.scenario.base import shown
+from testbed.scenario.base import plain, shown
 from testbed.scenario.durations import parse_duration
 
 T = TypeVar("T")
@@ -188,7 +189,7 @@ class LiveRun(Actions):
         """Let the clock go as far as an order needs, or wait for something new since ``seen``."""
         completed, held = self.completed, self._of_conductor.resting
         needed = completed + 1 if ordered.at is None else ordered.at - 1
-        if held and needed > completed:
+        if held and completed < needed <= self.scenario.steps:
             self.until(needed)
         else:
             self._await(lambda: self._changes != seen)
@@ -199,7 +200,7 @@ class LiveRun(Actions):
         return self._conductor
 
     def _order(self, event: dict[str, Any]) -> Ordered:
-        event = {key: value for key, value in event.items() if value is not None}
+        event = plain({key: value for key, value in event.items() if value is not None})
 
         def place(conductor: Conductor) -> Ordered:
             if "at" not in event and "when" not in event and conductor.held_at is not None:
@@ -214,7 +215,7 @@ class LiveRun(Actions):
             self.release()
         else:
             with suppress(RunOver):
-                self._ask(lambda conductor: conductor.hold(step))
+                self._ask(partial(_hold, step))
 
     def _step_of(self, moment: int | str, where: str) -> int:
         steps = self.scenario.steps
@@ -282,6 +283,14 @@ class LiveRun(Actions):
                 interrupted = error
         if interrupted is not None:
             raise interrupted
+
+
+def _hold(step: int, conductor: Conductor) -> None:
+    if step < conductor.granted:
+        raise UsageError(
+            f"until: got step {step}, which the clock has passed; allowed: {conductor.granted} or later, where it is"
+        )
+    conductor.hold(step)
 
 
 def _words_of(error: BaseException) -> str:
