@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast, get_args
 
@@ -42,6 +41,7 @@ def run(
 
     from testbed.cli.progress import progress_display
     from testbed.errors import UsageError
+    from testbed.orchestrator.preflight import default_folder
     from testbed.orchestrator.run import Run
     from testbed.orchestrator.table import end_table
     from testbed.scenario import load_scenario
@@ -53,7 +53,7 @@ def run(
     if links is not None:
         loaded = with_backend(loaded, _backend(links))
     if out is None:
-        out = Path("runs") / f"{_file_name(loaded.name)}-{datetime.now():%Y%m%d-%H%M%S}"
+        out = default_folder(loaded)
     console = Console(stderr=True)
     with progress_display(console, loaded.name, loaded.steps, shown=not quiet) as display:
         work = Run(loaded, out, progress=display.update, say=display.say)
@@ -75,7 +75,3 @@ def _backend(name: str) -> Backend:
     if name not in names:
         raise UsageError(f"--links {name}: no such backend; allowed: {', '.join(names)}{did_you_mean(name, names)}")
     return cast("Backend", name)
-
-
-def _file_name(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "._-" else "-" for c in name)

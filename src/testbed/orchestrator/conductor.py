@@ -85,18 +85,21 @@ class Conductor:
         self.setup, self.collector = setup, Collector(setup)
         self.failure: str | None = None
         self.reports: dict[str, Status] = {}
-        self.stop_asked = False
-        """Somebody outside asked for the end."""
+        self.stop_asked = ""
+        """Why the run is to end before its end; empty: nobody asked for it."""
         self.activity = 0
         """Grows with every message that was of use."""
         self.on_started: Callable[[], None] = lambda: None
+        self.on_progress: Callable[[], None] = lambda: None
+        """Called when all roles are there, when steps are complete, and when events are decided."""
         self.say: Callable[[str], None] = lambda line: None
         self._roles = [role.name for role in roles]
         self._present: set[str] = set()
         self._gone: list[str] = []
         """Roles that have left as they should."""
-        self._begun = False
+        self._begun = self._going = False
         self._granted = 0
+        self._told = 0
         self._steps, self._credit = setup.scenario.steps, setup.credit
         self._stopping = False
         self._recorder = recorder
@@ -137,6 +140,23 @@ class Conductor:
         return self.collector.finished or self.failure is not None
 
     @property
+    def granted(self) -> int:
+        """The last step that the clock has let begin."""
+        return self._granted
+
+    @property
+    def resting(self) -> bool:
+        """Whether everything is done up to the step at which the clock is held."""
+        held = self.timeline.held_at
+        return self._begun and held is not None and self.collector.completed >= held
+
+    @property
+    def held_at(self) -> int | None:
+        """The step beyond which the clock does not go, and that it has reached; None where it goes on."""
+        held = self.timeline.held_at
+        return self._granted if held is not None and self._granted >= held else None
+
+    @property
     def missing(self) -> list[str]:
         """Roles that are not there."""
         return [role for role in self._roles if role not in self._present]
@@ -151,6 +171,10 @@ class Conductor:
         if self.started and self.services.pending and self.collector.estimated == self._granted:
             return f"a service of {self.services.pending[0].plan.event.estimator} to join"
         return self.collector.awaiting() if self.started else f"roles to join: {', '.join(self.missing)}"
+
+    def outcome(self, number: int) -> Happened | None:
+        """What became of an order; None as long as that is to come."""
+        return next((e for e in self.timeline.happened(self._granted + 1) if e.number == number), None)
 
     def change_link(self, link: str, change: dict[str, Any]) -> int:
         """Let keys of a link have other values from the next step on that is not granted yet; that step.
@@ -179,16 +203,31 @@ class Conductor:
         return number
 
     def hold(self, step: int) -> None:
-        """Let the clock not go beyond a step, or beyond what is granted already. Raises UsageError in real time."""
-        if self.pacing is not None:
+        """Let the clock not go beyond a step, or beyond what is granted already.
+
+        Raises UsageError in real time, but for step 0 before it begins.
+        """
+        if self.pacing is not None and (step or self._going):
             raise UsageError("the run keeps real time, which cannot be held; allowed: in virtual time")
         self.timeline.held_at = step
+        self._go()
 
     def release(self) -> None:
         """Let the clock go on."""
         self.timeline.held_at = None
-        if self.started:
-            self._advance()
+        self._go()
+
+    def _go(self) -> None:
+        """Begin, unless the clock is held at the beginning, or go on."""
+        if not self._begun:
+            return
+        if not self._going and self.timeline.held_at != 0:
+            self._going = True
+            self.on_started()
+            if self.pacing is not None:
+                self.pacing.begin()
+                self.timeline.begin_real(self.node.bus.clock.monotonic_of(self.pacing.times.start_ns))
+        self._advance()
 
     def _check_going(self) -> None:
         if self.over or self._granted >= self._steps:
@@ -205,7 +244,7 @@ class Conductor:
             if asked.event is not None:
                 return json.dumps({"number": self.order(asked.event)}).encode()
             if asked.do == "stop":
-                self.stop_asked = True
+                self.end("stopped by command")
             elif asked.do == "hold":
                 self.hold(asked.step if asked.step is not None else self._granted)
             elif asked.do == "release":
@@ -220,7 +259,7 @@ class Conductor:
         """How far the run is, who estimates, and what has happened."""
         at = self._granted
         future = [e for e in self.timeline.happened(self._steps) if e.step > at + 1 and e.by != "timeline"]
-        roles = {name: self.services.role_at(name, at) for name in self.services.turns}
+        roles = {name: self.services.role_at(name, max(at, 1)) for name in self.services.turns}
         return {
             "completed": self.collector.completed,
             "granted": at,
@@ -244,15 +283,16 @@ class Conductor:
         """From time to time: launch what will be needed, and give up what does not come."""
         if self.started and not self.over:
             self.recovery.proceed()
-            busy = bool(self.recovery.down) or self.timeline.held_at is not None
+            busy = bool(self.recovery.down) or self.resting
             for role in self.watchdog.hung(self._present - {role for role in self._present if self._fails(role)}, busy):
                 self._is_lost(role, f"gave no sign of life for {self.watchdog.patience_s:g} s")
-        if self.timeline.held_at is not None:
+        if self.resting:
             self.activity += 1  # who holds the clock knows that nothing moves
         if self.timeline.pending and self.started and not self.over:
             if self.services.overdue(deadline_s):
                 self.activity += 1
             self._advance()
+            self.on_progress()
 
     def ended(self, role: str, how: str) -> None:
         """A role's process has ended; fail unless it has reported, can be recovered, or was not in charge yet."""
@@ -265,6 +305,10 @@ class Conductor:
         if self.recovery.policy(role) != "restart":
             raise UsageError(f"{role} cannot be started anew: its policy of recovery is {self.recovery.policy(role)}")
         self._is_lost(role, "was restarted")
+
+    def end(self, reason: str) -> None:
+        """Somebody asks for the end before the end; the first reason stays."""
+        self.stop_asked = self.stop_asked or reason
 
     def stop(self) -> None:
         """Tell all roles to report and leave."""
@@ -339,6 +383,7 @@ class Conductor:
             return False
         self.activity += 1
         self._advance()
+        self.on_progress()
         return True
 
     def _listen(self, role: str) -> None:
@@ -439,12 +484,8 @@ class Conductor:
             self._is_back(role)
         if not self.missing and not self.started:
             self._begun = True
-            self.on_started()
-            if self.pacing is not None:
-                self.pacing.begin()
-                self.timeline.begin_real(self.node.bus.clock.monotonic_of(self.pacing.times.start_ns))
-            else:
-                self._advance()
+            self.on_progress()
+            self._go()
 
     def _status(self, role: str, status: Status, _: Arrays) -> None:
         if status.state == "alive":
@@ -469,6 +510,9 @@ class Conductor:
     def _collected(self, topic: str, packet: Packet, arrays: Arrays) -> None:
         self.activity += 1
         self._write(topic, packet, arrays)
+        if self.collector.completed != self._told:
+            self._told = self.collector.completed
+            self.on_progress()
         self._advance()
 
     def _advance(self) -> None:
@@ -486,6 +530,7 @@ class Conductor:
             self.timeline.pending and not self.over and self.timeline.proceed(self._granted, self.collector.estimated)
         ):
             self._grant_more()
+            self.on_progress()
 
     def _grant_more(self) -> None:
         steps, credit = self._steps, self._credit

@@ -18,6 +18,7 @@ import numpy as np
 from testbed.channel.real.check import check_links
 from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
 from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.desk import Desk
 from testbed.orchestrator.interrupts import Interrupts, noted
 from testbed.orchestrator.lanes_file import NAME as LANES
 from testbed.orchestrator.lanes_file import LaneFigures, write_lanes
@@ -72,6 +73,7 @@ class Run:
         self._begun_s = time.monotonic()
         self._started_s: float | None = None
         self._reported = 0
+        self.desk = Desk()
 
     @np.errstate(all="ignore")  # what is not finite has no figure, and is counted
     def over_zenoh(self, external: Sequence[str] = ()) -> Summary:
@@ -101,6 +103,7 @@ class Run:
             cleanup.callback(supervisor.close, 0.0)
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.express)
             bus.timed = self._setup.real
+            self.desk.wake = lambda: bus.call(self.desk.work)
             cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
             conductor = self._conductor(bus, recorder, policies)
 
@@ -188,8 +191,12 @@ class Run:
                 for spec in self._roles:
                     join(spec)
                 while not conductor.over and not interrupts.asked and not conductor.stop_asked:
+                    self.desk.work()
                     if not network.step():
-                        conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
+                        if conductor.resting:
+                            self.desk.wait(_POLL_S)
+                        else:
+                            conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
                     self._tell(conductor)
             except TestbedError as error:
                 conductor.fail(str(error))
@@ -204,6 +211,7 @@ class Run:
         conductor = Conductor(bus, self._setup, self._roles, recorder, policies)  # type: ignore[arg-type]
         conductor.on_started, conductor.say = self._mark_start, self._say
         conductor.timeline.folder = self._out / SNAPSHOTS
+        self.desk.open(conductor)
         return conductor
 
     def _mark_start(self) -> None:
@@ -252,6 +260,7 @@ class Run:
             if now - looked < _POLL_S:
                 continue
             looked = now
+            self.desk.work()
             self._tell(conductor)
             for role, ending in supervisor.dead().items():
                 conductor.ended(role, f"{ending}{_last_words(supervisor.log_of(role))}")
@@ -297,7 +306,7 @@ class Run:
         conductor.timeline.give_up()
         if conductor.stop_asked and not conductor.collector.finished:
             status = "interrupted"
-            reason: str | None = "stopped by command"
+            reason: str | None = conductor.stop_asked
         elif interrupted and not conductor.collector.finished:
             status, reason = "interrupted", "interrupted by the user"
         elif conductor.failure is not None:
