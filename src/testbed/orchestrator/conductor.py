@@ -25,7 +25,7 @@ from testbed.orchestrator.timeline import Timeline
 from testbed.orchestrator.watchdog import Watchdog
 from testbed.plant.service import ROLE as PLANT
 from testbed.scenario.recovery import Policy
-from testbed.wire.begin import AT_START
+from testbed.wire.begin import AT_START, Begin
 from testbed.wire.bus import Bus
 from testbed.wire.codec import Rejected, encode
 from testbed.wire.keys import LinkName
@@ -80,8 +80,12 @@ class Conductor:
         roles: Sequence[RoleSpec],
         recorder: Recorder | None,
         policies: Mapping[str, Policy] | None = None,
+        begin: int = 0,
     ) -> None:
-        """policies: what becomes of a role that is lost; of one that is not among them, the run fails."""
+        """policies: what becomes of a role that is lost; of one that is not among them, the run fails.
+
+        begin: the step after which the run goes on.
+        """
         self.setup, self.collector = setup, Collector(setup)
         self.failure: str | None = None
         self.reports: dict[str, Status] = {}
@@ -103,7 +107,7 @@ class Conductor:
         self._steps, self._credit = setup.scenario.steps, setup.credit
         self._stopping = False
         self._recorder = recorder
-        self.node = setup.join(bus, ORCHESTRATOR)
+        self.node = setup.join(bus, ORCHESTRATOR, Begin(begin))
         self._commands = 0
         self._command = bus.publisher(self.node.keys.command)
         self.pacing = Pacing(bus, setup, self.collector, self._grant, self.fail) if setup.real else None
@@ -394,8 +398,27 @@ class Conductor:
 
     def _begin_of(self, role: bytes) -> bytes:
         name = role.decode(errors="replace")
-        late = self.started and name in self.recovery.specs
-        return (self.recovery.begin(name, late=True) if late else AT_START).to_bytes()
+        known = name in self.recovery.specs
+        return (self.recovery.begin(name, late=self.started) if known else AT_START).to_bytes()
+
+    def begin_after(self, step: int, reports: Mapping[str, Status]) -> None:
+        """Go on after a step; reports: the last words of roles that have left before."""
+        self._granted = step
+        self.reports.update(reports)
+        self._gone += reports
+        for name in self.services.turns:
+            if name not in {spec.name for spec in self.setup.scenario.estimators}:
+                self._take_estimates(name, OPEN)
+
+    @property
+    def last_words(self) -> dict[str, Status]:
+        """Of roles that have left."""
+        return {role: self.reports[role] for role in self._gone if role in self.reports}
+
+    @property
+    def awaited_words(self) -> bool:
+        """Whether a role that has left has not reported yet."""
+        return any(role in self._present and role not in self.reports for role in self._gone)
 
     def _advance_soon(self) -> None:
         self.activity += 1

@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from math import inf
 
 from testbed.errors import TestbedError, UsageError
 from testbed.estimator.service import role_of
@@ -54,8 +55,8 @@ class Recovery:
     """Policies, states and restarts.
 
     ``launch`` starts a role again, and ends what is left of its process; it may raise a TestbedError. ``forget`` is
-    called with the step of a new checkpoint; ``keep`` before, with the checkpoint, by who writes a journal: it says
-    whether that is done, and is asked again. ``missed``: called with a role that the run goes on without.
+    called with the step of a new checkpoint. ``keep`` is given, before, what may become one, by who writes a journal;
+    ``stable`` says up to which step that is done. ``missed``: called with a role that the run goes on without.
     """
 
     def __init__(
@@ -72,7 +73,8 @@ class Recovery:
         self.launch: Callable[[RoleSpec], None] = _nobody
         self.missed: Callable[[str, int], None] = lambda role, last: None
         self.forget: Callable[[int], None] = lambda step: None
-        self.keep: Callable[[Checkpoint], bool] = lambda checkpoint: True
+        self.keep: Callable[[Checkpoint], None] = lambda checkpoint: None
+        self.stable: Callable[[], float] = lambda: inf
         self.changes: Callable[[str], list[bytes]] = lambda role: []
         """The changes that a role was told of."""
         self.happened: list[Recovered] = []
@@ -184,11 +186,13 @@ class Recovery:
         whole = [step for step in self._coming if self._whole(step)]
         if not whole:
             return
-        newest = self._coming[max(whole)]
-        if self.keep(newest):
-            self.checkpoint = newest
-            self._coming = {step: coming for step, coming in self._coming.items() if step > newest.step}
-            self.forget(newest.step)
+        self.keep(self._coming[max(whole)])
+        stable = self.stable()
+        kept = max((step for step in whole if step <= stable), default=None)
+        if kept is not None:
+            self.checkpoint = self._coming[kept]
+            self._coming = {step: coming for step, coming in self._coming.items() if step > kept}
+            self.forget(kept)
 
     def _whole(self, step: int) -> bool:
         states = self._coming[step].states

@@ -93,6 +93,9 @@ class Services:
         self.leaves: Callable[[str], None] = lambda role: None
         self.taken: Callable[[RoleSpec, EstimatorSpec, int, list[tuple[Order, bytes]]], None] = lambda *given: None
         """Called with a service that begins after a step, and what it was told for that."""
+        self.decided: Callable[[Any, Origin, int], None] = lambda event, origin, step: None
+        """Called with what takes effect, and the step."""
+        self.refused: Callable[[Happened], None] = lambda entry: None
         self.retry: Callable[[], None] = lambda: None
         """Called where a service is not there yet: let ``proceed`` be called once more, soon."""
         self.comes_back: Callable[[str], bool] = lambda role: False
@@ -164,6 +167,13 @@ class Services:
         if entry is not None:
             self._refuse(entry, reason)
         return entry is not None
+
+    def count_again(self) -> None:
+        """Number the services that are to come behind those that there were."""
+        roles = {turn.role for turns in self.turns.values() for turn in turns}
+        for role in roles:
+            base, _, number = role.removeprefix(_PREFIX).partition(".")
+            self._count[_PREFIX + base] = max(self._count[_PREFIX + base], int(number or 1))
 
     def ended(self, role: str, last: int) -> None:
         """A service is lost, and its estimates end after a step."""
@@ -289,6 +299,7 @@ class Services:
         if entry.role is not None and plan.spec is not None:
             self.joins(entry.role.name, plan.spec.name, step)
         self.pending.remove(entry)
+        self.decided(plan.event, entry.origin, step)
         self.made.append((plan.event, step))
         self.happened.append(_happened(entry, step).model_copy(update={"bytes": handed}))
         if entry.held_s is not None:
@@ -327,10 +338,14 @@ class Services:
         step = entry.step if entry.step is not None else self._collector.estimated + 1
         happened = _happened(entry, step).model_copy(update={"ok": False, "reason": reason})
         self.happened.append(happened)
+        self.refused(happened)
         self._say(f"step {step}: {happened.text}")
         if entry.role is not None:
             self.unwanted.add(entry.role.name)
             self.drop(entry.role.name)
+
+
+_PREFIX = role_of("")
 
 
 def _happened(entry: _Pending, step: int) -> Happened:

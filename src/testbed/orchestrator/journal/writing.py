@@ -47,6 +47,7 @@ class Journal:
         """Checkpoints that were not written because a newer one came while the disk was busy."""
         self.figures_to = 0
         """The last step whose figures are in."""
+        self._ends: set[int] = set()
         self._notes = self._figures = -1
         self._failure: str | None = None
         self._changed = threading.Condition()
@@ -76,6 +77,7 @@ class Journal:
         """Keep the figures of the steps that came after the last ones, up to ``to``."""
         self._guarded(_write, self._figures, record_of(Figures(self.figures_to, to, content)))
         self.figures_to = to
+        self._ends.add(to)
 
     def checkpoint(
         self,
@@ -85,15 +87,18 @@ class Journal:
         facts: Mapping[str, Any],
         *before: Callable[[], None],
     ) -> None:
-        """Have a checkpoint written in the background; its figures must be in. It is on disk when ``stable`` says so.
+        """Have a checkpoint written in the background. It is on disk when ``stable`` says so.
+
+        Its figures must be in, some of them given up to its step and no further.
 
         One is written at a time; of those that come meanwhile the newest waits and the others are skipped, so that
         the run never waits for the disk. before: what else must be on disk first, called in the background; an
         OSError there is one of the journal.
         """
         self.check()
-        if self.figures_to != step:
-            raise ValueError(f"checkpoint of step {step} with figures up to {self.figures_to}")
+        if step not in self._ends:
+            raise ValueError(f"checkpoint of step {step}, and no figures end there")
+        self._ends = {end for end in self._ends if end >= step}
         due = Checkpoint(step, dict(states), collector, json.loads(json.dumps(facts)))
         with self._changed:
             self.skipped += self._due is not None
