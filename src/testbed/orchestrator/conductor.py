@@ -107,6 +107,8 @@ class Conductor:
         self._steps, self._credit = setup.scenario.steps, setup.credit
         self._stopping = False
         self._recorder = recorder
+        self.recorded: list[str] = []
+        """The topics of the links that are recorded."""
         self.node = setup.join(bus, ORCHESTRATOR, Begin(begin))
         self._commands = 0
         self._command = bus.publisher(self.node.keys.command)
@@ -474,6 +476,7 @@ class Conductor:
                 self._record(keys.delivered(link), model, link_role(link), f"{link}/delivered")
 
     def _record(self, key: str, model: type[Packet], source: str, topic: str) -> None:
+        self.recorded.append(topic)
         whole = self.setup.real or self.setup.tap >= self.setup.sizes.lanes
         taken = key if whole else self.node.keys.tap(key)
         self.node.on(taken, model, source, partial(self._write, topic), cut=not whole)

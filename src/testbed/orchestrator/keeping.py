@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 from testbed.orchestrator.conductor import Conductor
@@ -40,6 +41,8 @@ class Keeper:
         if now - self._flushed_s > _FLUSH_S:
             self._flushed_s = now
             self._flush(self._conductor.collector.completed)
+            if self._recorder is not None:
+                self._recorder.flush()
 
     def _completed(self, step: int) -> None:
         if self._every and not step % self._every:
@@ -52,15 +55,27 @@ class Keeper:
 
     def _keep(self, checkpoint: Checkpoint) -> None:
         step = checkpoint.step
-        if step <= self._offered or step not in self._collected or self._conductor.awaited_words:
+        if step <= self._offered or step not in self._collected or not self._is_all_there(step):
             return
         self._offered = step
         states = {(role, lane): data for role, by_lane in checkpoint.states.items() for lane, data in by_lane.items()}
         collector, facts = self._collected[step]
         facts["reports"] = {role: word.model_dump_json() for role, word in self._conductor.last_words.items()}
         self._collected = {later: kept for later, kept in self._collected.items() if later > step}
-        sync = () if self._recorder is None else (self._recorder.sync,)
+        sync: tuple[Callable[[], None], ...] = ()
+        if self._recorder is not None:
+            self._recorder.flush()
+            sync = (self._recorder.fsync,)
         self._journal.checkpoint(step, states, collector, facts, *sync)
+
+    def _is_all_there(self, step: int) -> bool:
+        """Whether the recording holds every packet up to a step, and who has left has reported."""
+        if self._conductor.awaited_words:
+            return False
+        recorder, blocks = self._recorder, self._conductor.setup.blocks
+        return recorder is None or all(
+            recorder.holds(step, topic, lane) for topic in self._conductor.recorded for lane, _ in blocks
+        )
 
     def _decided(self, event: Any, origin: Origin, step: int) -> None:
         if origin.number >= self._events:

@@ -121,6 +121,15 @@ def roles_at(roles: list[RoleSpec], begun: Resumed) -> list[RoleSpec]:
     ]
 
 
+def services_at(begun: Resumed) -> dict[str, EstimatorSpec]:
+    """The estimators of the roles that joined on the way, where the run goes on."""
+    if not begun.step:
+        return {}
+    assert begun.found.checkpoint is not None
+    turns = [turns[-1] for turns in _turns(begun.found.checkpoint.facts).values()]
+    return {turn.role: turn.spec for turn in turns if turn.first > 1}
+
+
 def go_on(conductor: Conductor, begun: Resumed) -> None:
     """Let a new conductor know what the old one knew."""
     timeline, services, step = conductor.timeline, conductor.services, begun.step

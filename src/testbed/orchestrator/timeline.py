@@ -217,7 +217,12 @@ class Timeline:
         for due in self._due:
             due.origin = origins.get(due.origin.number, due.origin)
         self._events = [
-            (event, entry if (new := origins.get(entry.number or -1)) is None else entry.model_copy(update=asdict(new)))
+            (
+                event,
+                entry
+                if (new := origins.get(-1 if entry.number is None else entry.number)) is None
+                else entry.model_copy(update=asdict(new)),
+            )
             for event, entry in self._events
         ]
         self._ordered = max(0, numbers - len(self._setup.scenario.events))
