@@ -188,14 +188,23 @@ def test_wrong_input_is_refused_at_once_in_one_line(wrong: Callable[[LiveRun], A
 
 def test_what_was_not_done_is_raised_by_its_result(tmp_path: Path) -> None:
     with start(tmp_path) as live:
-        killed = live.at(4).kill("plant")
-        with pytest.raises(RunFailed, match="nobody can kill plant"):
+        live.at(4).remove("ff")
+        killed = live.at(8).kill("estimator.ff")
+        with pytest.raises(RunFailed, match="'ff' does not run"):
             killed.result()
-        assert live.completed == 3
+        assert live.completed == 7
         never = live.when("trace_P(ff) > 1e9").mark("never")
         with pytest.raises(RunFailed, match="did not begin to hold"):
             never.result()
         assert live.over
+
+
+def test_the_death_of_a_process_that_nobody_starts_anew_fails_the_run(tmp_path: Path) -> None:
+    with start(tmp_path, recovery={"policy": "fail"}) as live:
+        assert live.at(6).kill("plant").result().step == 6
+        with pytest.raises(RunFailed, match="plant is gone"):
+            live.until(6)
+        assert live.completed == 5
 
 
 def test_an_exception_ends_the_run_and_keeps_what_was_collected(tmp_path: Path) -> None:

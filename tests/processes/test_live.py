@@ -82,3 +82,16 @@ def test_ctrl_c_in_a_script_stops_the_run_and_leaves_no_process(then: str, tmp_p
     summary = summary_of(tmp_path / "out")
     assert (summary["status"], summary["reason"]) == ("interrupted", "stopped: the script raised KeyboardInterrupt")
     assert summary["completed_steps"] >= 20
+
+
+def test_a_script_kills_processes_and_the_figures_stay(tmp_path: Path) -> None:
+    given = scenario(estimators=SPECS, recovery={"policy": "restart", "every": 5})
+    with given.start(tmp_path / "killed") as run:
+        run.until(8)
+        assert run.kill("estimator.ff").result().step == 9
+        assert run.at(14).kill("plant").result().step == 14
+        killed = run.wait()
+    plain = given.start(tmp_path / "plain", in_process=True).wait()
+    assert (killed.status, killed.completed_steps) == ("complete", 20)
+    assert killed.estimators == plain.estimators
+    assert killed.bounds == plain.bounds

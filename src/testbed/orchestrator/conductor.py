@@ -225,7 +225,7 @@ class Conductor:
 
     def _go(self) -> None:
         """Begin, unless the clock is held at the beginning, or go on."""
-        if not self._begun:
+        if not self._begun or self._stopping:
             return
         if not self._going and self.timeline.held_at != 0:
             self._going = True

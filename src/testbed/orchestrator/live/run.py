@@ -179,8 +179,9 @@ class LiveRun(Actions):
     def outcome(self, number: int) -> Happened | None:
         """What became of an order; None as long as that is to come, or where the run ended before."""
         if self._over:
-            events = () if self._summary is None else self._summary.events
-            return next((event for event in events if event.number == number), None)
+            told = () if self._summary is None else self._summary.events
+            found = next((event for event in told if event.number == number), None)
+            return found or self._of_conductor.outcome(number)  # done, and the run ended at that very step
         with suppress(RunOver):
             return self._ask(lambda conductor: conductor.outcome(number))
         return None
