@@ -21,6 +21,7 @@ from testbed.orchestrator.pacing import Pacing
 from testbed.orchestrator.preflight import plan_of
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.services import Services
+from testbed.orchestrator.services_in_time import ServicesInTime
 from testbed.orchestrator.summary import Happened
 from testbed.plant.service import ROLE as PLANT
 from testbed.scenario.changes import in_turn
@@ -96,7 +97,8 @@ class Conductor:
             if isinstance(event, LinkEvent)
         ]
         """Which links change, or have changed, at which step."""
-        self.services = Services(bus, setup, self.collector, lambda line: self.say(line))
+        parts = bus, setup, self.collector, lambda line: self.say(line)
+        self.services = Services(*parts) if self.pacing is None else ServicesInTime(*parts, self.pacing)
         self.services.watch, self.services.joins = self._watch, self._joins
         self.services.leaves, self.services.failed = self._leaves, self.fail
         self._gates: dict[str, Gate] = {}
@@ -183,10 +185,6 @@ class Conductor:
         """
         if not self.started:
             raise UsageError(f"the run has not begun; waiting for {self.awaiting()}")
-        if self.pacing is not None:
-            raise UsageError(
-                "the run keeps real time, which does not wait for a new estimator; allowed: in virtual time"
-            )
         if self.over or self._granted >= self._steps:
             raise UsageError("the run has no step left that could change")
         plan = plan_of(self.setup, self.services, event, self._granted + 1)
@@ -224,13 +222,18 @@ class Conductor:
 
     def tick(self, deadline_s: float) -> None:
         """From time to time: launch what will be needed, and give up what does not come."""
-        if self.services.pending and self.started and not self.over:
+        if self.services.pending and not self.over:
             if self.services.overdue(deadline_s):
                 self.activity += 1
-            self._advance()
+            if self.started:
+                self._advance()
+            else:
+                self._begin()
 
     def ended(self, role: str, how: str) -> None:
         """A role's process has ended; fail unless it has reported, or was not in charge of anything yet."""
+        if self.services.deciding(role):
+            return  # what it has sent comes before the news that it is gone
         if role not in self.reports and role not in self._gone and not self._lost(role, f"{role} ended: {how}"):
             self.fail(f"{role} ended: {how}")
 
@@ -323,7 +326,10 @@ class Conductor:
         role = key.rsplit("/", 1)[1]
         if alive and self.services.here(role):
             self.activity += 1
-            self._advance()
+            if self.started:
+                self._advance()
+            else:
+                self._begin()
             return
         if not alive and not self._stopping and self._lost(role, f"{role} is gone"):
             self._present.discard(role)
@@ -337,13 +343,16 @@ class Conductor:
             return
         self._present.add(role)
         self.activity += 1
-        if not self.missing and not self.started:
+        self._begin()
+
+    def _begin(self) -> None:
+        """Once everybody is there."""
+        if not self.started and self.services.all_are_there() and not self.missing:
             self._begun = True
             self.on_started()
             if self.pacing is not None:
                 self.pacing.begin()
-            else:
-                self._advance()
+            self._advance()
 
     def _status(self, role: str, status: Status, _: Arrays) -> None:
         self.reports[role] = status
@@ -373,6 +382,8 @@ class Conductor:
         In real time the clock does.
         """
         if self.pacing is not None:
+            if self.services.pending and not self.over:
+                self.services.proceed(self._granted, self.collector.estimated)
             return
         self._grant_more()
         while (

@@ -117,12 +117,6 @@ class Scenario(Part):
     def _check_events(cls, events: tuple[Event, ...], info: ValidationInfo) -> tuple[Event, ...]:
         if {"links", "clock", "steps"} <= info.data.keys():
             for i, event in enumerate(events):
-                if info.data["clock"].mode == "real" and not isinstance(event, LinkEvent):
-                    raise problem(
-                        f"got {event.action!r} with clock mode 'real', which does not wait for a new estimator; "
-                        "allowed there: set",
-                        f"[{i}].action",
-                    )
                 if isinstance(event, LinkEvent):
                     _check_event(info.data["links"], events, i, info.data["clock"], info.data["steps"])
         if {"estimators", "input", "clock", "steps"} <= info.data.keys():

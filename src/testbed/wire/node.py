@@ -30,6 +30,27 @@ class Gate:
 
     def __init__(self, passed_over: int | None = None) -> None:
         self.passed_over = passed_over
+        self.gone_by = 0
+        """Packets of a block and key that nobody can have any more: of the block that is furthest."""
+        self._kept: list[Callable[[], None]] | None = None
+
+    def keep(self) -> None:
+        """Keep what comes from now on until it opens."""
+        self._kept = []
+
+    def keeps(self, packet: Packet, take: Callable[[], None]) -> bool:
+        """Whether a packet that comes to the closed gate is kept."""
+        if self._kept is None:
+            self.gone_by = max(self.gone_by, packet.step - packet.FIRST_STEP + 1)
+            return False
+        self._kept.append(take)
+        return True
+
+    def open(self, passed_over: int) -> None:
+        """Let pass what is of interest, and first what was kept of it."""
+        kept, self._kept, self.passed_over = self._kept or [], None, passed_over
+        for take in kept:
+            take()
 
 
 OPEN = Gate(0)
@@ -106,28 +127,37 @@ class Node:
         source: the role that sends here, or what says of a header whether its sender is right. needs: arrays that a
         packet must have here. last: the last step, where it is not that of the run. cut: packets hold the recorded
         lanes only. gate: the packets that are passed over at first; the first that is taken has the number that it
-        must have had all before it come.
+        must have had all before it come, or follows on the one that was seen before.
         """
         sizes = self.sizes if last is None else replace(self.sizes, steps=last)
         decoder, turns = Decoder(model, self.run, sizes), _Turns(None if cut else sizes.lanes_per_packet, sizes.lanes)
         is_source = source if callable(source) else partial(_is_from, source)
         expected = 0 if gate.passed_over == 0 else None
 
-        def receive(_: str, payload: bytes) -> None:
+        def receive(key: str, payload: bytes) -> None:
             nonlocal expected
             for message, outcome in decoder.read(payload):
                 try:
                     if isinstance(outcome, Rejected):
                         raise outcome
                     header, arrays = outcome
-                    if expected is None:
-                        if not isinstance(header, Packet) or not _is_due(header, gate):
+                    early = False
+                    if gate is not OPEN and isinstance(header, Packet):
+                        if gate.passed_over is None:
+                            if not gate.keeps(header, partial(receive, key, message)):
+                                expected = header.seq + 1
                             continue
-                        expected = turns.begin(gate.passed_over or 0, header)
+                        early = header.step - header.FIRST_STEP < gate.passed_over
+                        first = turns.begin(gate.passed_over)
+                        if expected is None:
+                            expected = header.seq if early else first
                     if not is_source(header):
                         raise Rejected("source", f"from {header.source}")
                     if header.seq != expected:
                         raise Rejected("sequence", f"number {header.seq}, expected {expected}")
+                    if early:
+                        expected += 1
+                        continue
                     for name in needs:
                         if name not in arrays:
                             raise Rejected("arrays", f"lacks {name}")
@@ -171,13 +201,12 @@ class _Turns:
     def __init__(self, per_packet: int | None, lanes: int) -> None:
         self._per_packet, self._lanes = per_packet, lanes
         self._due: dict[int, int] = {}
+        self._passed_over = 0
 
-    def begin(self, passed_over: int, packet: Packet) -> int:
-        """Let so many packets of each block be done; the number of the next one on the key."""
-        size = self._per_packet or self._lanes
-        for lane in range(0, self._lanes, size):
-            self._due[lane] = packet.FIRST_STEP + passed_over
-        return passed_over * len(self._due)
+    def begin(self, passed_over: int) -> int:
+        """Let so many packets of each block be done; the number of the next one on the key, where all are done."""
+        self._passed_over = passed_over
+        return passed_over * len(range(0, self._lanes, self._per_packet or self._lanes))
 
     def check(self, packet: Packet) -> None:
         lane, size = packet.lane, self._per_packet
@@ -185,7 +214,7 @@ class _Turns:
             raise Rejected("range", f"lanes {lane}…{lane + packet.lanes - 1} are not a packet of this run")
         step, due = packet.step, self._due.get(lane)
         if due is None:
-            due = packet.FIRST_STEP
+            due = packet.FIRST_STEP + self._passed_over
         if step != due:
             raise Rejected("order", f"step {step}, expected {due}")
         self._due[lane] = due + 1
@@ -193,10 +222,6 @@ class _Turns:
 
 def _is_from(source: str, header: Message) -> bool:
     return header.source == source
-
-
-def _is_due(packet: Packet, gate: Gate) -> bool:
-    return gate.passed_over is not None and packet.step - packet.FIRST_STEP >= gate.passed_over
 
 
 def _numbered(publish: Publish, encoder: PacketEncoder, gate: Gate, blocks: int) -> Send:
