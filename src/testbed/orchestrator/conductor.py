@@ -20,6 +20,7 @@ from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.recovery import Recovery
 from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Services
+from testbed.orchestrator.services_in_time import ServicesInTime
 from testbed.orchestrator.summary import Happened
 from testbed.orchestrator.timeline import Timeline
 from testbed.orchestrator.watchdog import Watchdog
@@ -113,7 +114,8 @@ class Conductor:
         self._commands = 0
         self._command = bus.publisher(self.node.keys.command)
         self.pacing = Pacing(bus, setup, self.collector, self._grant, self.fail) if setup.real else None
-        self.services = Services(bus, setup, self.collector, lambda line: self.say(line))
+        parts = bus, setup, self.collector, lambda line: self.say(line)
+        self.services = Services(*parts) if self.pacing is None else ServicesInTime(*parts, self.pacing)
         self.timeline = Timeline(bus, setup, self.collector, self.services, lambda line: self.say(line))
         self._clock = bus.publisher(self.node.keys.clock)  # behind the others: what is held back is sent in this order
         self._clock_seq = 0
@@ -294,14 +296,19 @@ class Conductor:
                 self._is_lost(role, f"gave no sign of life for {self.watchdog.patience_s:g} s")
         if self.resting:
             self.activity += 1  # who holds the clock knows that nothing moves
-        if self.timeline.pending and self.started and not self.over:
+        if self.timeline.pending and not self.over:
             if self.services.overdue(deadline_s):
                 self.activity += 1
-            self._advance()
-            self.on_progress()
+            if self.started:
+                self._advance()
+                self.on_progress()
+            else:
+                self._begin()
 
     def ended(self, role: str, how: str) -> None:
         """A role's process has ended; fail unless it has reported, can be recovered, or was not in charge yet."""
+        if self.services.deciding(role):
+            return  # what it has sent comes before the news that it is gone
         if role not in self.reports and role not in self._gone:
             self.recovery.down.pop(role, None)
             self._is_lost(role, f"ended: {how}")
@@ -491,7 +498,10 @@ class Conductor:
         role = key.rsplit("/", 1)[1]
         if alive and self.services.here(role):
             self.activity += 1
-            self._advance()
+            if self.started:
+                self._advance()
+            else:
+                self._begin()
             return
         if not alive and not self._stopping and self._lost(role, f"{role} is gone"):
             self._present.discard(role)
@@ -508,7 +518,11 @@ class Conductor:
         self.activity += 1
         if role in self.recovery.down:
             self._is_back(role)
-        if not self.missing and not self.started:
+        self._begin()
+
+    def _begin(self) -> None:
+        """Once everybody is there."""
+        if not self.started and self.services.all_are_there() and not self.missing:
             self._begun = True
             self.on_progress()
             self._go()
@@ -550,6 +564,8 @@ class Conductor:
             return
         if self.pacing is not None:
             self.timeline.proceed_real(self._granted, self.collector.estimated)
+            if self.services.pending and not self.over:
+                self.services.proceed(self._granted, self.collector.estimated)
             return
         self._grant_more()
         while (

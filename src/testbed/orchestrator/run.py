@@ -385,7 +385,7 @@ class Run:
             steps_per_s=completed / wall if wall > 0 else None,
             lane_steps_per_s=completed * lanes / wall if wall > 0 else None,
             window=self._setup.window,
-            swaps=tuple(conductor.services.downtimes),
+            swaps=conductor.services.swaps(),
         )
         conductor.timeline.give_up()
         if conductor.stop_asked and not conductor.collector.finished:

@@ -128,6 +128,18 @@ class Services:
         """Of the events that are not decided yet."""
         return {entry.origin.number for entry in self.pending if entry.origin.by != "timeline"}
 
+    def all_are_there(self) -> bool:
+        """Whether the run can begin."""
+        return True
+
+    def deciding(self, role: str) -> bool:
+        """Whether a role may have begun to serve without our knowing."""
+        return False
+
+    def swaps(self) -> tuple[Downtime, ...]:
+        """What the changes that were made cost."""
+        return tuple(self.downtimes)
+
     def proceed(self, granted: int, estimated: int) -> bool:
         """Launch what is due, and make the changes for which everything is there; whether any was decided."""
         before = len(self.pending)
@@ -194,15 +206,19 @@ class Services:
 
     def _launch_due(self, granted: int, estimated: int) -> None:
         now = time.monotonic()
-        if self._began_s is None:
-            self._began_s = now
-        elapsed = now - self._began_s
-        ahead = START_S * estimated / elapsed if elapsed > 0.1 else 0.0
+        ahead = self._ahead(now, estimated)
         for entry in list(self.pending):
             if entry.launched_s is not None or not self._needs_service(entry):
                 continue
             if entry.step is None or entry.step - 1 <= max(granted, estimated + ahead):
                 self._launch(entry, now)
+
+    def _ahead(self, now: float, estimated: int) -> float:
+        """Steps before its own at which a service is launched."""
+        if self._began_s is None:
+            self._began_s = now
+        elapsed = now - self._began_s
+        return START_S * estimated / elapsed if elapsed > 0.1 else 0.0
 
     def _launch(self, entry: _Pending, now: float) -> None:
         spec = entry.plan.spec
@@ -213,11 +229,15 @@ class Services:
         arguments = ("--name", spec.name, "--role", name, "--spec", spec.model_dump_json())
         entry.role = RoleSpec(name, builder(spec.name, spec), "testbed.estimator", arguments)
         entry.launched_s = now
+        self._listen(name)
         self.watch(name, spec.name)
         try:
             self.launch(entry.role)
         except TestbedError as error:
             self._refuse(entry, str(error))
+
+    def _listen(self, role: str) -> None:
+        """To a role that is about to be launched."""
 
     def _make(self, entry: _Pending) -> None:
         """Make a change now, between two steps."""
@@ -244,6 +264,7 @@ class Services:
                 ask(self._bus, self._key(leaving), Order(action="leave", step=done))
             except TestbedError as error:
                 self.failed(f"{leaving} did not leave at step {entry.step}: {error}")
+        self._count_on(entry, entry.step)
         self._settle(entry, entry.step, handed)
 
     def _are_ready(self, plan: Planned, done: int) -> bool:
@@ -279,8 +300,8 @@ class Services:
         self.taken(to, plan.spec, done, told)
         return sum(len(data) for _, data in told)
 
-    def _settle(self, entry: _Pending, step: int, handed: int) -> None:
-        """Everybody has agreed: whose estimates count from now on."""
+    def _count_on(self, entry: _Pending, step: int) -> None:
+        """Whose estimates count from now on."""
         plan, steps = entry.plan, self._setup.scenario.steps
         if plan.promoted is not None:
             role = self._serving(plan.promoted)
@@ -296,6 +317,10 @@ class Services:
             self.turns.setdefault(name, []).append(Turn(step, role, plan.spec, carried))
             self.last[name] = plan.spec.until or steps
             self._collector.expect(name, step, self.last[name])
+
+    def _settle(self, entry: _Pending, step: int, handed: int) -> None:
+        """Everybody has agreed."""
+        plan = entry.plan
         if entry.role is not None and plan.spec is not None:
             self.joins(entry.role.name, plan.spec.name, step)
         self.pending.remove(entry)

@@ -290,10 +290,6 @@ class Timeline:
         events = self._setup.scenario.events
         try:
             made = _Ordered.model_validate({"events": (table if given else {**table, "at": granted + 1},)}).events[0]
-            if self._setup.real and isinstance(made, ESTIMATOR_EVENTS):
-                raise UsageError(
-                    "the run keeps real time, which does not wait for a new estimator; allowed: in virtual time"
-                )
             check_event(made, self._around, events)
         except ValidationError as error:
             raise UsageError(explain(error, _Ordered).removeprefix("events[0]").lstrip(".: ")) from None
