@@ -53,7 +53,7 @@ def test_a_role_that_loses_its_connection_leaves_and_may_come_again(tmp_path: Pa
     port = free_port()
     recovery = '[recovery]\nevery = 100\nroles = { "estimator.aoe" = "restart" }'
     head = f'[transport]\nendpoint = "tcp/127.0.0.1:{port}"\n{recovery}'
-    scenario = write_scenario(tmp_path, steps=3_000, head=head)
+    scenario = write_scenario(tmp_path, steps=1_500, head=head)
     process = start(scenario, tmp_path / "out", "--external", "estimator.aoe")
     assert process.stderr is not None
 
