@@ -74,6 +74,8 @@ class Conductor:
         self.activity = 0
         """Grows with every message that was of use."""
         self.on_started: Callable[[], None] = lambda: None
+        self.on_joined: Callable[[str], None] = lambda role: None
+        """Called with a role that has come while the run goes."""
         self.say: Callable[[str], None] = lambda line: None
         self._roles = list(roles)
         self._present: set[str] = set()
@@ -327,6 +329,7 @@ class Conductor:
         if alive and self.services.here(role):
             self.activity += 1
             if self.started:
+                self.on_joined(role)
                 self._advance()
             else:
                 self._begin()

@@ -190,6 +190,7 @@ class Run:
             priorities.raise_all({ORCHESTRATOR: os.getpid(), **pids()})
 
         conductor.on_started = start
+        conductor.on_joined = lambda role: priorities.raise_all({role: pids()[role]} if role in pids() else {})
         try:
             yield
         finally:
