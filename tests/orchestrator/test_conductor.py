@@ -9,6 +9,7 @@ import pytest
 
 from orchestrator.runs import scenario
 from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.roles import RoleSpec
 from testbed.wire.codec import PacketEncoder, encode
 from testbed.wire.keys import Keys
 from testbed.wire.memory_bus import MemoryBus, MemoryNetwork
@@ -21,6 +22,10 @@ KEYS = Keys(RUN)
 ROLES = ["plant", "bounds", "estimator.aoe", "estimator.kfio"]
 
 
+def _never(node: Node, setup: Setup) -> Any:
+    raise AssertionError
+
+
 class Bench:
     """A conductor, and everybody else."""
 
@@ -28,7 +33,8 @@ class Bench:
         own = {"steps": 6, "lanes": 2, "estimators": [{"name": "aoe"}, {"name": "kfio", "acks": "perfect", "until": 4}]}
         self.setup = Setup(RUN, scenario(**{**own, "clock": {"window": 2}, **changes}))
         self.network = MemoryNetwork()
-        self.conductor = Conductor(self.network.bus(), self.setup, ROLES, None)
+        roles = [RoleSpec(role, _never, "none") for role in ROLES]
+        self.conductor = Conductor(self.network.bus(), self.setup, roles, None)
         self.started: list[int] = []
         self.conductor.on_started = lambda: self.started.append(1)
         self.grants: list[int] = []

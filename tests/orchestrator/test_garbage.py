@@ -109,10 +109,11 @@ def test_garbage_changes_no_figure_and_is_counted(schedule: int | None, lanes_pe
     noisy = run(given, tmp_path / "noisy", schedule, Noisy)
     network = Noisy.current
     assert noisy.status == "complete"
-    assert {**figures(noisy), "rejected": {}} == figures(clean)
+    assert {**figures(noisy), "rejected": {}, "repeated": {}} == figures(clean)
     assert sum(network.injected.values()) == INJECTIONS
     assert set(network.injected) >= {key for key in network.all_keys() if "status" not in key}
-    assert sum(sum(reasons.values()) for reasons in noisy.rejected.values()) == network.arrivals
+    refused = sum(sum(reasons.values()) for reasons in noisy.rejected.values())
+    assert refused + sum(noisy.repeated.values()) == network.arrivals
     reasons = {reason for of_role in noisy.rejected.values() for reason in of_role}
     assert reasons >= {"format", "schema", "run", "source", "sequence", "finite", "range"}
 
@@ -122,5 +123,6 @@ def test_garbage_does_not_disturb_a_closed_loop(schedule: int | None, tmp_path: 
     given = scenario(input={"kind": "feedback", "gain": [[0.6, 0.3]]})
     clean = run(given, tmp_path / "clean")
     noisy = run(given, tmp_path / "noisy", schedule, Noisy)
-    assert {**figures(noisy), "rejected": {}} == figures(clean)
-    assert sum(sum(reasons.values()) for reasons in noisy.rejected.values()) == Noisy.current.arrivals
+    assert {**figures(noisy), "rejected": {}, "repeated": {}} == figures(clean)
+    refused = sum(sum(reasons.values()) for reasons in noisy.rejected.values())
+    assert refused + sum(noisy.repeated.values()) == Noisy.current.arrivals

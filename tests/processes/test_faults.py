@@ -36,10 +36,13 @@ Running = tuple[subprocess.Popen[str], dict[int, str], str]
 
 
 def running(tmp_path: Path, *, head: str = "", at_least: int = 400) -> Running:
-    """A run that is past a step, its children, and its key prefix."""
+    """A run that recovers nothing and is past a step, its children, and its key prefix."""
     port = free_port()
+    recovery = '[recovery]\npolicy = "fail"'
     scenario = write_scenario(
-        tmp_path, steps=LONG, head=f'record = "first"\n[transport]\nendpoint = "tcp/127.0.0.1:{port}"\n{head}'
+        tmp_path,
+        steps=LONG,
+        head=f'record = "first"\n{recovery}\n[transport]\nendpoint = "tcp/127.0.0.1:{port}"\n{head}',
     )
     process = start(scenario, tmp_path / "out")
     with client(port) as session:

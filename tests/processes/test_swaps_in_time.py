@@ -67,7 +67,7 @@ def going(tmp_path: Path, steps: int, tail: str = "") -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("sent", [pytest.param(signal.SIGKILL, marks=pytest.mark.slow), signal.SIGSTOP])
 def test_a_new_service_that_fails_leaves_the_old_one_in_charge(sent: signal.Signals, tmp_path: Path) -> None:
     """One that is killed, and one that hangs: it joins, and does not take what it is handed."""
     process = going(tmp_path, 500, event(150, "swap", estimator='"aoe"', to='{ kind = "imm" }'))
@@ -84,6 +84,7 @@ def test_a_new_service_that_fails_leaves_the_old_one_in_charge(sent: signal.Sign
     assert summary["rejected"] == {}
 
 
+@pytest.mark.slow
 def test_by_command(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out, process = tmp_path / "out", going(tmp_path, 20_000)
     assert run_command(["ctl", str(out), "swap", "aoe", "--to", "aoe", "--handover", "full"]) == 0

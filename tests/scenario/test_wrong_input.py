@@ -550,7 +550,7 @@ def test_wrong_value(changes: dict[str, Any], expected: str) -> None:
 def test_an_unknown_key_like_no_other_lists_what_is_allowed() -> None:
     assert message(changed({"zzz": 1})) == (
         "unknown key 'zzz'; allowed: name, steps, lanes, seed, record, bounds, clock, system, uncertainty, "
-        "estimators, actuator, input, cost, links, transport, events"
+        "estimators, actuator, input, cost, links, transport, recovery, events"
     )
 
 

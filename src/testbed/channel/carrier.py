@@ -23,6 +23,11 @@ class Carrier(Protocol):
         """When something happens next; None while nothing is under way."""
         ...
 
+    @property
+    def under_way(self) -> set[int]:
+        """Messages that may still be handed to the receiver."""
+        ...
+
     def send(self, number: int, size: int, now_ns: int) -> None:
         """Take message ``number`` = 0, 1, 2, … of ``size`` bytes."""
         ...
@@ -55,6 +60,10 @@ class Datagrams:
     @property
     def next_ns(self) -> int | None:
         return self._flight.next_ns
+
+    @property
+    def under_way(self) -> set[int]:
+        return {number for number, _ in self._flight}
 
     def send(self, number: int, size: int, now_ns: int) -> None:
         copies = self._pipeline.send(size, now_ns)

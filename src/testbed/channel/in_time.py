@@ -116,7 +116,7 @@ def _sampled(link: SteppedImpairments, period_ns: int, until_ns: int, size: int)
         _note(arrived, carrier.advance((number + 1) * period_ns - 1), period_ns, until_ns)
     _note(arrived, carrier.advance((SAMPLED - 1) * period_ns + until_ns), period_ns, until_ns)
     for fate in arrived.tolist():
-        counts.count(0, fate)
+        counts.count(fate)
     (bad, recovered), (failed, good) = counts.transitions
     if not counts.dropped:
         return Chain.lossless()

@@ -146,7 +146,7 @@ class LossProcess:
 
 @dataclass
 class LossCounts:
-    """What happened to the packets of a link, counted over lane-packets; the books balance by construction of the sums.
+    """What happened to the packets of a block of lanes, counted over lane-packets; the books balance by construction.
 
     ``transitions[a][b]``: how often a packet of fate b followed one of fate a in the same lane.
     """
@@ -155,12 +155,12 @@ class LossCounts:
     delivered: int = 0
     bursts: int = 0
     transitions: list[list[int]] = field(default_factory=lambda: [[0, 0], [0, 0]])
-    _last: dict[int, Mask] = field(default_factory=dict)
+    last: Mask | None = None
+    """The fate of the last packet."""
 
-    def count(self, lane: int, arrived: Mask) -> None:
-        """Take in the fate of one packet of the block that begins at ``lane``."""
-        last = self._last.get(lane)
-        self._last[lane] = arrived
+    def count(self, arrived: Mask) -> None:
+        """Take in the fate of one packet."""
+        last, self.last = self.last, arrived
         if isinstance(arrived, bool):
             self.sent += 1
             self.delivered += arrived

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from testbed.channel.chains import chain_of
 from testbed.channel.gilbert_elliott import GilbertElliott, GilbertElliottProcess
 from testbed.channel.hidden import Hidden, HiddenChain, HiddenProcess
 from testbed.channel.loss import LossProcess
 from testbed.channel.replay import Recorded, ReplayProcess, Scripted
-from testbed.numerics.lanes import Mask
+from testbed.errors import UsageError
+from testbed.numerics.lanes import Mask, mask_of
 from testbed.numerics.streams import Stream
 from testbed.scenario import Loss, ScriptedLoss, TraceLoss
 
@@ -65,3 +69,18 @@ def goes_on(process: FateProcess, before: FateProcess) -> bool:
         return False
     process.state = before.state
     return True
+
+
+def index_of_state(process: FateProcess) -> NDArray[np.int64] | None:
+    """The state of a process as a number for each lane, (M,); None where it has none."""
+    return None if process.state is None else np.atleast_1d(np.asarray(process.state, dtype=np.int64))
+
+
+def set_state(process: FateProcess, index: NDArray[np.int64]) -> None:
+    """Let a process go on from what ``index_of_state`` gave. Raises UsageError where it has no such state."""
+    if index.min() < 0 or index.max() >= process.states:
+        raise UsageError(f"state {index.min()} … {index.max()} of a loss process; allowed: 0 … {process.states - 1}")
+    if not isinstance(process, HiddenProcess):
+        process.state = mask_of(index)
+    else:
+        process.state = int(index[0]) if len(index) == 1 else index.astype(np.intp)

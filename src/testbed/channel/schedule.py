@@ -19,6 +19,10 @@ class Schedule(Generic[T]):
     def __len__(self) -> int:
         return len(self._heap)
 
+    def __iter__(self) -> Iterator[T]:
+        """The items, in no order."""
+        return (item for _, _, item in self._heap)
+
     @property
     def next_ns(self) -> int | None:
         """When the first item is due; None if there is none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import partial
 from typing import Any
 
@@ -9,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.channel.carriers import carriers_of
-from testbed.channel.loss import LossCounts
+from testbed.channel.instant import InstantBlock
 from testbed.channel.packets import packet_bytes
-from testbed.channel.processes import FateProcess, goes_on, process_of
+from testbed.channel.processes import FateProcess, process_of
 from testbed.channel.real.pace import Pace
 from testbed.channel.real.service import RealLinkService
 from testbed.channel.real.timer import Timer
@@ -27,6 +28,7 @@ from testbed.wire.keys import LinkName
 from testbed.wire.messages import Acknowledgement, Change, Control, Observation, Packet
 from testbed.wire.node import ORCHESTRATOR, Node, PacketHandler
 from testbed.wire.setup import Setup
+from testbed.wire.state import pack, unpack
 
 _TYPES: dict[LinkName, tuple[type[Packet], str, str]] = {
     "control": (Control, "controller", "u"),
@@ -92,23 +94,30 @@ class LinkService:
     passed on as a bare mask, which tells the receiver that the step is over (virtual time has no other way).
     What arrives late goes with the packet of the step in which it does; late control packets are dropped.
     Where the scenario says that noise is received in place of a lost observation, that stands there with mask 0.
+
+    Its state, on a link that takes no time: the state of the loss process and the counts. On one that does: the
+    contents under way, and the rest is worked out again from packet 0 on, since fates do not depend on contents; that
+    takes as long as the link took with them, about 10 µs a packet and lane without a transport, 40 µs with tcp.
     """
 
     def __init__(self, node: Node, setup: Setup, *, link: LinkName) -> None:
         model, sender, self._content = _TYPES[link]
         scenario = setup.scenario
-        self._first_step = model.FIRST_STEP
+        self._node, self._first_step, self._lanes = node, model.FIRST_STEP, dict(setup.blocks)
         self._changes = scenario.changes_of(link)
         settings: SteppedImpairments = getattr(scenario.links, link)
         self._now = {lane: (0, settings) for lane, _ in setup.blocks}
         """By block of lanes: how many changes were made, and the link after them."""
         timed = scenario.takes_time(link)
-        self._losses = {lane: loss_process(scenario, link, lane, lanes) for lane, lanes in setup.blocks if not timed}
+        self._instant = {
+            lane: InstantBlock(loss_process(scenario, link, lane, lanes), lanes)
+            for lane, lanes in setup.blocks
+            if not timed
+        }
         self._process_of = partial(_process, scenario, link)
         size = packet_bytes(scenario, link)
         self._timed = {lane: timed_block(scenario, link, lane, lanes, size) for lane, lanes in setup.blocks if timed}
         self._keeps_late = link != "control"
-        self._counts = LossCounts()
         self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
         noise = link == "observation" and scenario.links.observation.on_loss == "noise"
         self._instead = "noise" if noise else None
@@ -121,7 +130,43 @@ class LinkService:
 
     @property
     def counters(self) -> dict[str, int]:
-        return timed_counters(list(self._timed.values()), self._keeps_late) or self._counts.as_counters()
+        if self._timed:
+            return timed_counters(list(self._timed.values()), self._keeps_late)
+        total: Counter[str] = Counter()
+        for block in self._instant.values():
+            total.update(block.counts.as_counters())
+        cut = sum(block.cut for block in self._instant.values())
+        causes = {"dropped_cut": cut, "dropped_loss": total["dropped"] - cut} if cut else {}
+        return {**total, **causes}
+
+    @property
+    def gives_state(self) -> bool:
+        return True
+
+    def state(self, lane: int) -> bytes:
+        made, block = self._now[lane][0], self._timed.get(lane)
+        if block is not None:
+            return pack(block.on_the_way(), step=block.packets, changes=made)
+        arrays, numbers = self._instant[lane].state()
+        return pack(arrays, step=self._instant[lane].packets, changes=made, **numbers)
+
+    def resume(self, lane: int, step: int, state: bytes) -> None:
+        """Raises UsageError for what is no state of this link after so many packets and changes."""
+        given, lanes, block = unpack(state), self._lanes[lane], self._timed.get(lane)
+        given.expect(step=step)
+        if block is None:
+            self._change(lane, lanes, self._first_step + step - 1)
+            self._instant[lane].resume(given)
+        else:
+            for number in range(step):
+                self._change(lane, lanes, self._first_step + number)
+                if self._keeps_late:
+                    block.again(number)
+                else:
+                    block.in_time(number)
+            block.recall(given)
+        given.expect(changes=self._now[lane][0])
+        given.end()
 
     def _note(self, change: Change, _: dict[str, NDArray[Any]]) -> None:
         """Take an order to change from a step on that is still to come; the orchestrator has checked it."""
@@ -138,17 +183,16 @@ class LinkService:
             if self._timed:
                 self._timed[lane].change(settings)
             else:
-                before = self._losses[lane]
-                self._losses[lane] = self._process_of(settings.loss, lane, lanes)
-                goes_on(self._losses[lane], before)
+                self._instant[lane].change(self._process_of(settings.loss, lane, lanes))
 
     def _pass_on(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         lane = packet.lane
         if self._changes:
             self._change(lane, packet.lanes, packet.step)
-        arrived = self._losses[lane].next(packet.step - self._first_step)
+        number = packet.step - self._first_step
+        arrived = self._instant[lane].arrives(number, up=self._now[lane][1].up)
         self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
-        self._counts.count(lane, arrived)
+        self._node.done(number + 1, lane)
 
     def _pass_on_timed(self, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         lane, number = packet.lane, packet.step - self._first_step
@@ -160,6 +204,7 @@ class LinkService:
             arrived = self._timed[lane].in_time(number)
             delivered = self._content_of(arrays, arrived if packet.lanes > 1 else bool(arrived[0]))
         self._deliver(packet.step, lane, packet.lanes, delivered)
+        self._node.done(number + 1, lane)
 
     def _content_of(self, arrays: dict[str, NDArray[Any]], arrived: Mask) -> dict[str, NDArray[Any]]:
         if self._instead is not None:

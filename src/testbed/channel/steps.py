@@ -84,6 +84,11 @@ class SteppedLink:
             carrier.change(settings)
 
     @property
+    def under_way(self) -> set[int]:
+        """Packets that may still arrive in some lane."""
+        return set().union(*(carrier.under_way for carrier in self._carriers))
+
+    @property
     def transport(self) -> Counter[str]:
         """What the connections of all lanes did; nothing where there are none."""
         total: Counter[str] = Counter()

@@ -10,15 +10,19 @@ from numpy.typing import NDArray
 
 from testbed.channel.books import Books
 from testbed.channel.loss import LossCounts
-from testbed.channel.steps import Arrivals, StepLink
+from testbed.channel.steps import Arrivals, StepLink, SteppedLink
+from testbed.errors import UsageError
 from testbed.numerics.lanes import Bools
 from testbed.scenario.links import Impairments
+from testbed.wire.state import Unpacked
 
 Arrays = dict[str, NDArray[Any]]
 
 _KEEP_BYTES = 64_000_000
 _KEEP_LEAST = 64
 _KEEP_BESIDE = 400  # bytes that a packet takes beside its content
+
+_UNKNOWN = np.zeros(0)
 
 
 class TimedBlock:
@@ -69,7 +73,47 @@ class TimedBlock:
 
     def pass_on(self, number: int, content: NDArray[Any]) -> Arrays:
         """Send packet ``number``, content (M, …), and what is delivered before the next: arrays of a message."""
-        self._remember(number, content)
+        self._remember(number, np.array(content))
+        fresh = self._fresh(number)
+        mask = fresh.pop(number, np.zeros(self._lanes, dtype=np.bool_))
+        out: Arrays = {"mask": mask.astype(np.uint8)}
+        if mask.any():
+            out = {self._name: blanked(content, mask), **out}
+        return {**out, **self._late_arrays(sorted(fresh.items()))}
+
+    def again(self, number: int) -> None:
+        """What ``pass_on`` does, for a packet whose content is not known; see ``recall``."""
+        self._remember(number, _UNKNOWN)
+        self._fresh(number)
+
+    @property
+    def packets(self) -> int:
+        """How many there were."""
+        return self.counts.sent // self._lanes
+
+    def on_the_way(self) -> Arrays:
+        """By number, the contents that may still be handed over: all that fates and numbers do not say again."""
+        assert isinstance(self._link, SteppedLink)
+        batches = {one for n in self._link.under_way | {self.packets} for one in range(n - self._batch + 1, n + 1)}
+        numbers = sorted(n for n in batches & self._contents.keys() if not self._known[n].all())
+        if not numbers:
+            return {}
+        return {"numbers": np.array(numbers), "contents": np.array([self._contents[n] for n in numbers])}
+
+    def recall(self, given: Unpacked) -> None:
+        """Take the contents that ``on_the_way`` gave. Raises UsageError where they are none."""
+        if "numbers" not in given:
+            return
+        numbers = given.array("numbers", np.int64, None).tolist()
+        kind, shape = (np.uint8, ()) if self._name == "nu" else (np.float64, (None,))
+        contents = given.array("contents", kind, len(numbers), self._lanes, *shape)
+        for number, content in zip(numbers, contents, strict=True):
+            if number not in self._contents:
+                raise UsageError(f"state: packet {number} is not on its way")
+            self._contents[number] = content
+
+    def _fresh(self, number: int) -> dict[int, Bools]:
+        """Send packet ``number``; the lanes in which it and others are known from now on."""
         arrivals = self._send(number)
         fresh: dict[int, Bools] = {}
         for packet, lanes in [*arrivals.late, (number, arrivals.in_time)]:
@@ -85,15 +129,11 @@ class TimedBlock:
                 if new.any():
                     self._known[one] |= new
                     fresh[one] = fresh.get(one, np.zeros(self._lanes, dtype=np.bool_)) | new
-        mask = fresh.pop(number, np.zeros(self._lanes, dtype=np.bool_))
-        out: Arrays = {"mask": mask.astype(np.uint8)}
-        if mask.any():
-            out = {self._name: blanked(content, mask), **out}
-        return {**out, **self._late_arrays(sorted(fresh.items()))}
+        return fresh
 
     def _send(self, number: int) -> Arrivals:
         arrivals = self._link.send(number)
-        self.counts.count(0, arrivals.in_time if self._lanes > 1 else bool(arrivals.in_time[0]))
+        self.counts.count(arrivals.in_time if self._lanes > 1 else bool(arrivals.in_time[0]))
         return arrivals
 
     def _late_arrays(self, late: list[tuple[int, Bools]]) -> Arrays:
@@ -107,7 +147,7 @@ class TimedBlock:
         }
 
     def _remember(self, number: int, content: NDArray[Any]) -> None:
-        self._contents[number] = np.array(content)
+        self._contents[number] = content
         self._known[number] = np.zeros(self._lanes, dtype=np.bool_)
         old = number - self._keep - 1
         self._contents.pop(old, None)

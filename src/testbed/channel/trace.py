@@ -58,7 +58,7 @@ def sample_trace(scenario: Scenario, link: LinkName, number: int, *, seed: int, 
             pipeline.change(settings)
         sent_ns = seq * period_ns
         arrivals = [copy.at_ns for copy in pipeline.send(size, sent_ns) if copy.flip is None]
-        counts.count(lane, bool(arrivals))
+        counts.count(bool(arrivals))
         rows += [(at_ns, seq, sent_ns, at_ns) for at_ns in arrivals] or [(sent_ns, seq, sent_ns, None)]
     rows.sort(key=lambda row: row[:2])
     model = chain_of(loss_of(scenario, link))

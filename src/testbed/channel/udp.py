@@ -41,6 +41,10 @@ class UdpCarrier:
     def next_ns(self) -> int | None:
         return self._on_the_way.next_ns
 
+    @property
+    def under_way(self) -> set[int]:
+        return {message.number for message, _, _ in self._on_the_way}
+
     def fragments(self, size: int) -> list[int]:
         """Sizes of the IP packets of a message of ``size`` bytes; all but the last carry a multiple of 8 (RFC 791)."""
         rest = size + self._header

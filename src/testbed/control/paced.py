@@ -14,6 +14,7 @@ from testbed.scenario import Following
 from testbed.wire.messages import ClockMessage, EstimateMessage
 from testbed.wire.node import Node
 from testbed.wire.setup import Setup
+from testbed.wire.state import Unpacked
 
 
 class Pace:
@@ -37,6 +38,10 @@ class Pace:
         self._granted = min(clock.step, self._steps)
         self._wait()
 
+    def begin_at(self, step: int) -> None:
+        """The next step is ``step``."""
+        self._next = step
+
     def _wait(self) -> None:
         if self._start_ns is not None and not self._waiting and self._next < self._granted:
             self._waiting = True
@@ -59,9 +64,9 @@ class PacedOpenLoop(OpenLoopService):
     def _tick(self, clock: ClockMessage, _: dict[str, NDArray[Any]]) -> None:
         self._pace.grant(clock)
 
-    def _act(self, k: int) -> None:
-        for lane, lanes, source in self._sources:
-            self._send(k, lane, lanes, {"u": source(k)})
+    def resume(self, lane: int, step: int, state: bytes) -> None:
+        super().resume(lane, step, state)
+        self._pace.begin_at(step)
 
 
 class PacedClosedLoop(ClosedLoopService):
@@ -74,12 +79,33 @@ class PacedClosedLoop(ClosedLoopService):
     def __init__(self, node: Node, setup: Setup, source: Following) -> None:
         self._pace = Pace(node, setup, self._act)
         system = setup.scenario.system
+        self._n = system.n
         mean, covariance = np.array(system.x0_mean), np.array(system.P0)
         self._newest: dict[int, tuple[int, Floats, Floats]] = {
             lane: (0, np.tile(mean, (lanes, 1)), np.tile(covariance, (lanes, 1, 1))) for lane, lanes in setup.blocks
         }
+        self._held, self._held_steps = ({lane: 0 for lane, _ in setup.blocks} for _ in range(2))
         super().__init__(node, setup, source)
-        self.counters |= {"held": 0, "held_steps": 0}
+
+    @property
+    def counters(self) -> dict[str, int]:
+        held = {"held": sum(self._held.values()), "held_steps": max(self._held_steps.values())}
+        return {**super().counters, **held}
+
+    def _given(self, lane: int) -> tuple[dict[str, NDArray[Any]], dict[str, int]]:
+        """After step s: what it knew when u_{s−1} was sent."""
+        arrays, numbers = super()._given(lane)
+        newest, x_hat, P = self._newest[lane]
+        held = {"held": self._held[lane], "held_steps": self._held_steps[lane]}
+        return {**arrays, "x_hat": x_hat, "P": P}, {**numbers, "newest": newest, **held}
+
+    def _resume(self, lane: int, step: int, given: Unpacked) -> None:
+        super()._resume(lane, step, given)
+        n, lanes = self._n, self._lanes[lane]
+        x_hat, P = given.array("x_hat", np.float64, lanes, n), given.array("P", np.float64, lanes, n, n)
+        self._newest[lane] = given.number("newest"), x_hat, P
+        self._held[lane], self._held_steps[lane] = given.number("held"), given.number("held_steps")
+        self._pace.begin_at(step)
 
     def _tick(self, clock: ClockMessage, _: dict[str, NDArray[Any]]) -> None:
         self._pace.grant(clock)
@@ -92,6 +118,9 @@ class PacedClosedLoop(ClosedLoopService):
         for lane, (step, x_hat, P) in self._newest.items():
             if k > 0:
                 self._compute(k, lane, x_hat, P)
-            self.counters["held"] += step < k
-            self.counters["held_steps"] = max(self.counters["held_steps"], k - step)
+            self._held[lane] += step < k
+            self._held_steps[lane] = max(self._held_steps[lane], k - step)
+            self._done[lane] = k + 1
         self._send_ready()
+        for lane in self._newest:
+            self._node.done(k + 1, lane)

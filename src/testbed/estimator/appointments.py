@@ -13,7 +13,6 @@ from typing import Literal, Protocol
 from testbed.errors import UsageError
 from testbed.estimator.outlet import Outlet
 from testbed.wire.ahead import Ahead, Handed, Word, pack, unpack
-from testbed.wire.messages import EstimateMessage
 from testbed.wire.node import OPEN, Gate, Node
 
 Form = Literal["cold", "moments", "full"]
@@ -31,6 +30,10 @@ class Changing(Protocol):
         ...
 
     def give(self, lane: int, form: Form) -> bytes: ...
+
+    def serve(self, name: str, step: int) -> None:
+        """Let the estimates of later steps go under a name."""
+        ...
 
     def start(self, lane: int, form: Form, data: bytes, step: int) -> None:
         """Let a block go on after ``step``. Raises a TestbedError where it cannot."""
@@ -139,8 +142,8 @@ class Appointments:
             self._service.gate.open(order.step)
         else:
             assert order.name is not None
-            key = self._node.keys.estimate(order.name)
-            self._service.outlet.release(self._node.sender(key, EstimateMessage, gate=Gate(order.step)))
+            self._service.serve(order.name, order.step)
+            self._service.outlet.release()
 
     def _stay(self, order: Ahead) -> None:
         held = any(handing.stop for handing in self._handing if handing.to == order.to)

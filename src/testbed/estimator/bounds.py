@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 from testbed.channel.law import LossModel
 from testbed.estimator.model import Model
 from testbed.estimator.riccati import Gain, phi, predict
-from testbed.numerics.lanes import Constant, Floats, Mask, Matrix, constant, mask_of, matrices_of
+from testbed.numerics.lanes import Constant, Floats, Mask, Matrix, constant, mask_of, matrices_of, matrix_of
+from testbed.numerics.packed import Named
 from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.symbols import Shape
 
@@ -48,6 +49,16 @@ class CovarianceBound:
     def __init__(self, model: Model, noise: Floats, lanes: int) -> None:
         _, self.p = model.prior(lanes)
         self._advance = _stepper(model, constant(noise), lanes)
+        self.lanes, self._n = lanes, model.n
+
+    @property
+    def state(self) -> Floats:
+        """The bound as it is now, (M, n, n): all that the next one depends on."""
+        return matrices_of(self.p, self.lanes)
+
+    def resume(self, given: Named, name: str) -> None:
+        """Go on from what ``state`` was. Raises UsageError where ``given`` does not have that under ``name``."""
+        self.p = matrix_of(given.array(name, np.float64, self.lanes, self._n, self._n))
 
     def step(self, arrived: NDArray[Any]) -> Matrix:
         """The bound after the observations ``arrived`` (M,) of the next step."""
@@ -71,6 +82,27 @@ class LateBound:
         self._depth, self._k, self.old = depth, 0, 0
         self._states: dict[int, tuple[Matrix, NDArray[Any]]] = {}
         """By step: what was known before it, and where its observation has arrived."""
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """The bound before the first step that is remembered, and what has arrived of it and later ones."""
+        if not self._states:
+            return {}
+        first = min(self._states)
+        known = [self._states[step][1] for step in range(first, self._k + 1)]
+        return {
+            "before": matrices_of(self._states[first][0], self._bound.lanes),
+            "known": np.array(known, dtype=np.uint8),
+        }
+
+    def resume(self, step: int, given: Named, old: int) -> None:
+        """Go on after ``step`` steps, from what ``state`` gave, by at most ``depth`` steps; ``old``: the count."""
+        self._k, self.old = step, old
+        if not step:
+            return
+        self._bound.resume(given, "before")
+        known = given.array("known", np.uint8, min(step, self._depth), self._bound.lanes)
+        for number, arrived in enumerate(known, start=step - len(known) + 1):
+            self._take(number, arrived)
 
     def step(self, arrived: NDArray[Any], late: Iterable[tuple[int, NDArray[Any]]] = ()) -> Matrix:
         """The bound after the next step's observations ``arrived`` (M,), and ``late`` ones: (step, lanes (M,))."""
@@ -115,6 +147,16 @@ class Bounds:
     def components(self, arrived: NDArray[Any]) -> tuple[Matrix, Matrix | None]:
         """The same as components."""
         return self._lower.step(arrived), None if self._upper is None else self._upper.step(arrived)
+
+    def state(self) -> dict[str, Floats]:
+        """Both bounds as they are now, (M, n, n)."""
+        return {"lower": self._lower.state, **({} if self._upper is None else {"upper": self._upper.state})}
+
+    def resume(self, given: Named) -> None:
+        """Go on from what ``state`` gave. Raises UsageError for anything else."""
+        self._lower.resume(given, "lower")
+        if self._upper is not None:
+            self._upper.resume(given, "upper")
 
 
 def _advance(model: Model, noise: Constant, gamma: Mask, P: Matrix) -> tuple[Matrix]:

@@ -16,6 +16,7 @@ from testbed.wire.codec import all_finite
 from testbed.wire.messages import BoundsMessage, Observation
 from testbed.wire.node import Node
 from testbed.wire.setup import Setup
+from testbed.wire.state import pack, unpack
 
 ROLE = "bounds"
 _DEPTH = 256
@@ -29,6 +30,7 @@ class BoundsService:
     """
 
     def __init__(self, node: Node, setup: Setup) -> None:
+        self._node, self._done = node, {lane: 0 for lane, _ in setup.blocks}
         model, bound = model_of(setup.scenario), control_bound(setup.scenario)
         factor = None if model.holds else model.control.covariance_factor
         self._blocks = {lane: Bounds(model, bound, lanes) for lane, lanes in setup.blocks}
@@ -50,6 +52,32 @@ class BoundsService:
         old = sum(bound.old for bound in self._late.values())
         return {"old_observations": old} if old else {}
 
+    @property
+    def gives_state(self) -> bool:
+        return True
+
+    def state(self, lane: int) -> bytes:
+        arrays: dict[str, NDArray[Any]] = {**self._blocks[lane].state()}
+        if lane in self._correlated:
+            arrays["correlated"] = self._correlated[lane].state
+        late = self._late.get(lane)
+        if late is not None:
+            arrays |= late.state()
+        return pack(arrays, step=self._done[lane], old=0 if late is None else late.old)
+
+    def resume(self, lane: int, step: int, state: bytes) -> None:
+        """Raises UsageError for what is no state of these bounds after so many steps."""
+        given = unpack(state)
+        given.expect(step=step)
+        self._blocks[lane].resume(given)
+        if lane in self._correlated:
+            self._correlated[lane].resume(given, "correlated")
+        old, late = given.number("old"), self._late.get(lane)
+        if late is not None:
+            late.resume(step, given, old)
+        given.end()
+        self._done[lane] = step
+
     def _take(self, packet: Observation, arrays: dict[str, NDArray[Any]]) -> None:
         lower, upper = self._blocks[packet.lane].components(arrays["mask"])
         if packet.lane in self._late:
@@ -64,6 +92,8 @@ class BoundsService:
         if not all(all_finite(values) for values in traces.values()):
             raise RunFailed(f"the bounds left the range of floating-point numbers at step {packet.step}")
         self._send(packet.step, packet.lane, packet.lanes, traces)
+        self._done[packet.lane] = packet.step
+        self._node.done(packet.step, packet.lane)
 
 
 def _steps(arrays: dict[str, NDArray[Any]]) -> NDArray[Any]:

@@ -21,10 +21,11 @@ from testbed.estimator.registry import create, model_of
 from testbed.numerics.lanes import Floats
 from testbed.scenario import EstimatorSpec, Scenario
 from testbed.wire.codec import all_finite
-from testbed.wire.handover import Order, answered
+from testbed.wire.handover import Behind, Order, answered
 from testbed.wire.messages import Acknowledgement, Control, EstimateMessage, Observation, Packet
 from testbed.wire.node import OPEN, Gate, Node
 from testbed.wire.setup import Setup
+from testbed.wire.state import pack, unpack
 
 
 def role_of(name: str) -> str:
@@ -76,7 +77,7 @@ class EstimatorService:
         self._node, self._name, self._model = node, name, model
         self._noise = scenario.links.observation.on_loss == "noise"
         self.until = spec.until or scenario.steps
-        self.outlet = Outlet(node.sender(node.keys.estimate(name), EstimateMessage, gate=self.gate))
+        self.outlet = Outlet(name, node.sender(node.keys.estimate(name), EstimateMessage, gate=self.gate))
         self._blocks = {
             lane: _Block(
                 create(spec.kind, model, lanes=lanes, options=spec.options, lane=lane),
@@ -103,6 +104,11 @@ class EstimatorService:
             self._appointments = Appointments(node, self)
         else:
             node.bus.answer(keys.handover(node.name), partial(answered, self._ordered))
+        for order, data in node.begin.orders:
+            if order.action == "take":
+                self._ordered(order, data)
+            elif order.name is not None:
+                self.serve(order.name, order.step)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -112,6 +118,34 @@ class EstimatorService:
             for key, value in counters.items():
                 total[key] = total.get(key, 0) + value
         return total
+
+    @property
+    def gives_state(self) -> bool:
+        return all(isinstance(block.estimator, Restartable) for block in self._blocks.values())
+
+    def state(self, lane: int) -> bytes:
+        """A full snapshot, and the name under which the estimates go."""
+        snapshot, done = self.give(lane, "full"), self._blocks[lane].done
+        return pack({"snapshot": _bytes(snapshot), "name": _bytes(self.outlet.name_at(done).encode())}, step=done)
+
+    def resume(self, lane: int, step: int, state: bytes) -> None:
+        """Raises UsageError for what is no state of this estimator after so many steps."""
+        given, block = unpack(state), self._blocks[lane]
+        done = min(step, self.until)
+        given.expect(step=done)
+        snapshot, name = (given.array(part, np.uint8, None).tobytes() for part in ("snapshot", "name"))
+        given.end()
+        block.latest = start(block.refilter, "full", snapshot, model=self._model, lanes=block.lanes, step=done)
+        block.done = done
+        if self.gate is not OPEN:
+            self.gate.passed_over = step
+        if name != self.outlet.name_at(step).encode():
+            self.serve(name.decode(), step)
+
+    def serve(self, name: str, step: int) -> None:
+        """Let the estimates of step + 1 and later go under a name."""
+        send = self._node.sender(self._node.keys.estimate(name), EstimateMessage, gate=Gate(step))
+        self.outlet.turn(name, send, after=step)
 
     def done(self) -> Mapping[int, int]:
         """Steps that are done, by first lane of the block."""
@@ -171,19 +205,26 @@ class EstimatorService:
             if block.done != step:
                 raise UsageError(f"asked for the state after step {step}, and is at {block.done}")
             return self.give(order.lane, order.form)
+        if any(block.done < min(step, self.until) for block in self._blocks.values()):
+            raise Behind
         if any(block.done != min(step, self.until) for block in self._blocks.values()):
             raise UsageError(f"asked after step {step}, and is at another")
         if order.action == "leave":
             self._node.stopped = True
+        elif order.action == "ready":
+            return b""
         elif order.name is not None:
-            key = self._node.keys.estimate(order.name)
-            self._name = order.name
-            self.outlet.release(self._node.sender(key, EstimateMessage, gate=Gate(step)))
+            self.serve(order.name, step)
+            self.outlet.release()
         return b""
 
     def _take(self, part: str, ahead: int, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         step = packet.step + ahead
-        if step > self.until or self._node.stopped:
+        if self._node.stopped:
+            return
+        if step > self.until:
+            if part == "y":
+                self._node.done(step, packet.lane)
             return
         whole = self._blocks[packet.lane].join(step, part, arrays)
         if whole is not None:
@@ -206,6 +247,7 @@ class EstimatorService:
             arrays |= {"error_bound": estimate.error_bound, "error_bound_P": estimate.error_bound_P}
         block.done, block.latest = step, estimate
         self.outlet(step, lane, block.lanes, arrays)
+        self._node.done(step, lane)
         if self._appointments is not None:
             self._appointments.done(step, lane)
 
@@ -229,3 +271,7 @@ def _late_observations(arrays: dict[str, NDArray[Any]]) -> tuple[LateObservation
         return ()
     y, arrived = arrays["late_y"], arrays["late_mask"]
     return tuple(LateObservation(int(of), y[:, i], arrived[:, i]) for i, of in enumerate(arrays["late_step"][0]))
+
+
+def _bytes(data: bytes) -> NDArray[np.uint8]:
+    return np.frombuffer(data, dtype=np.uint8)

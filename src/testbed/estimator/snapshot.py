@@ -3,54 +3,43 @@
 *Moments* are x̂ and P, from which an estimator of any kind can start. A *full* snapshot has the state besides, with
 which an estimator of the same kind, model and options goes on to the same bits.
 
-Bytes: ``NCSS``, uint32 header length, JSON header, the arrays it lists one after the other (little-endian, C order),
-and the BLAKE2b digest (16 bytes) of all that.
+Bytes: ``NCSS`` and what ``testbed.numerics.packed`` says.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from hashlib import blake2b
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from testbed.errors import UsageError
 from testbed.estimator.model import Estimate, Estimator, Restartable
 from testbed.estimator.registry import kind_of
 from testbed.estimator.state import MAX_STEP
+from testbed.numerics.packed import Header, Layout
 
 MAX_BYTES = 1 << 28
-MAX_HEADER = 1 << 16
-FORMAT = 1
-_MAGIC = b"NCSS"
-_DIGEST = 16
 _STATE, _COUNTER = "state.", "counter."
 MEMORY = "memory."
-_CODES: dict[str, np.dtype[Any]] = {"<f8": np.dtype("<f8"), "<i8": np.dtype("<i8"), "|u1": np.dtype("u1")}
 
 Form = Literal["full", "moments"]
-_Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.-]{0,63}$")]
 _Size = Annotated[int, Field(ge=1, le=2**31)]
-_Shape = Annotated[tuple[Annotated[int, Field(ge=0, le=2**31)], ...], Field(max_length=8)]
-_Entry = tuple[_Name, Literal["<f8", "<i8", "|u1"], _Shape]
 
 
-class _Header(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    v: Literal[1]
+class _Header(Header):
     form: Form
     kind: Annotated[str, Field(min_length=1, max_length=256)]
     version: Annotated[int, Field(ge=0, le=2**31)]
     step: Annotated[int, Field(ge=0, le=MAX_STEP)]
     lanes: _Size
     n: _Size
-    arrays: Annotated[tuple[_Entry, ...], Field(max_length=256)]
+
+
+_LAYOUT = Layout(b"NCSS", "snapshot", _Header, MAX_BYTES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,49 +65,23 @@ class Snapshot:
 
     def to_bytes(self) -> bytes:
         """Raises UsageError for a type that has no code, for what is not finite, or for more than MAX_BYTES."""
-        size = sum(array.nbytes for array in self.arrays.values())
-        if size > MAX_BYTES - MAX_HEADER:
-            raise UsageError(f"snapshot of {size} bytes; allowed: {MAX_BYTES - MAX_HEADER}")
-        entries, content = [], []
-        for name, array in self.arrays.items():
-            code = next((code for code, dtype in _CODES.items() if array.dtype == dtype), None)
-            if code is None:
-                raise UsageError(f"snapshot: {name!r} is {array.dtype}; allowed: float64, int64, uint8")
-            if not np.isfinite(array).all():
-                raise UsageError(f"snapshot: {name!r} holds a value that is not finite")
-            entries.append((name, code, array.shape))
-            content.append(np.ascontiguousarray(array, dtype=_CODES[code]).tobytes())
-        try:
-            given = {name: getattr(self, name) for name in ("form", "kind", "version", "step", "lanes", "n")}
-            header = _Header.model_validate({"v": FORMAT, **given, "arrays": tuple(entries)})
-        except ValidationError as error:
-            raise UsageError(f"snapshot: {_first(error)}") from None
-        text = header.model_dump_json().encode()
-        if len(text) > MAX_HEADER:
-            raise UsageError(f"snapshot: header of {len(text)} bytes; allowed: {MAX_HEADER}")
-        body = b"".join([_MAGIC, len(text).to_bytes(4, "little"), text, *content])
-        return body + _digest(body)
+        self._check_finite()
+        fields = {name: getattr(self, name) for name in ("form", "kind", "version", "step", "lanes", "n")}
+        return _LAYOUT.write(fields, self.arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Snapshot:
         """Raises UsageError for everything that ``to_bytes`` does not write."""
-        if not 8 + _DIGEST <= len(data) <= MAX_BYTES + _DIGEST:
-            raise UsageError(f"snapshot of {len(data)} bytes; allowed: {8 + _DIGEST} … {MAX_BYTES + _DIGEST}")
-        if data[:4] != _MAGIC:
-            raise UsageError("not a snapshot: it does not begin with NCSS")
-        if _digest(data[:-_DIGEST]) != data[-_DIGEST:]:
-            raise UsageError("snapshot: damaged, its digest does not match")
-        length = int.from_bytes(data[4:8], "little")
-        if length > MAX_HEADER or 8 + length + _DIGEST > len(data):
-            raise UsageError(f"snapshot: header of {length} bytes in {len(data)}; allowed: {MAX_HEADER} at most")
-        try:
-            header = _Header.model_validate_json(data[8 : 8 + length])
-        except ValidationError as error:
-            raise UsageError(f"snapshot: {_first(error)}") from None
-        arrays = _arrays(header, data, 8 + length)
+        header, arrays = _LAYOUT.read(data)
         found = cls(header.form, header.kind, header.version, header.step, header.lanes, header.n, arrays)
+        found._check_finite()
         found._check()
         return found
+
+    def _check_finite(self) -> None:
+        for name, array in self.arrays.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise UsageError(f"snapshot: {name!r} holds a value that is not finite")
 
     def _check(self) -> None:
         for name, shape in (("x_hat", (self.lanes, self.n)), ("P", (self.lanes, self.n, self.n))):
@@ -185,34 +148,3 @@ def _restartable(estimator: Estimator) -> Restartable:
             "it lacks one of STATE_VERSION, state, set_state, start_from"
         )
     return estimator
-
-
-def _arrays(header: _Header, data: bytes, offset: int) -> dict[str, NDArray[Any]]:
-    out: dict[str, NDArray[Any]] = {}
-    end = len(data) - _DIGEST
-    for name, code, shape in header.arrays:
-        dtype, count = _CODES[code], math.prod(shape)
-        if name in out:
-            raise UsageError(f"snapshot: {name!r} is there twice")
-        if count * dtype.itemsize > end - offset:
-            raise UsageError(f"snapshot: {name!r} {shape} is longer than the {end - offset} bytes that are left")
-        try:
-            array = np.frombuffer(data, dtype, count, offset).reshape(shape)
-        except ValueError as error:
-            raise UsageError(f"snapshot: {name!r} {shape}: {error}") from None
-        if not np.isfinite(array).all():
-            raise UsageError(f"snapshot: {name!r} holds a value that is not finite")
-        out[name] = array
-        offset += array.nbytes
-    if offset != end:
-        raise UsageError(f"snapshot: {end - offset} bytes behind the last array")
-    return out
-
-
-def _digest(body: bytes) -> bytes:
-    return blake2b(body, digest_size=_DIGEST).digest()
-
-
-def _first(error: ValidationError) -> str:
-    first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-    return " ".join(f"{'.'.join(map(str, first['loc'])) or 'header'}: {first['msg']}".split())

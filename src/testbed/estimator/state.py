@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.channel.law import Law
-from testbed.errors import UsageError, did_you_mean
+from testbed.errors import UsageError
 from testbed.estimator.model import Model
 from testbed.numerics.lanes import (
     Component,
@@ -22,6 +22,7 @@ from testbed.numerics.lanes import (
     symmetric,
     vector_of,
 )
+from testbed.numerics.packed import Named
 
 State: TypeAlias = dict[str, NDArray[Any]]
 """Arrays of float64, uint8 or int64 by name; ``k``, of shape (), is the number of steps done."""
@@ -35,20 +36,13 @@ def state_of(step: int, lanes: int, parts: Mapping[str, Component | Vector | Mat
     return {"k": np.array(step, dtype=np.int64), **{name: _packed(part, lanes) for name, part in parts.items()}}
 
 
-class Given:
-    """A state that is read. Every wrong name, type or shape is a UsageError; what is read are copies."""
+class Given(Named):
+    """A state that is read."""
 
     def __init__(self, state: Mapping[str, NDArray[Any]], lanes: int, n: int) -> None:
-        self._state, self._lanes, self._n = state, lanes, n
-        self._read: set[str] = set()
+        super().__init__(state)
+        self._lanes, self._n = lanes, n
         self.step = self.integer("k", MAX_STEP)
-
-    def integer(self, name: str, largest: int) -> int:
-        """A number 0 … largest."""
-        value = int(self.array(name, np.int64))
-        if not 0 <= value <= largest:
-            raise UsageError(f"state: {name!r} is {value}; allowed: 0 … {largest}")
-        return value
 
     def component(self, name: str) -> Component:
         array = self.array(name, np.float64, self._lanes)
@@ -63,24 +57,6 @@ class Given:
         n = self._n if size is None else size
         matrix = matrix_of(self.array(name, np.float64, self._lanes, n, n))
         return symmetric(n, lambda i, j: matrix[i][j])
-
-    def array(self, name: str, dtype: Any, *shape: int) -> NDArray[Any]:
-        self._read.add(name)
-        array = self._state.get(name)
-        expected = f"{np.dtype(dtype)} {shape}"
-        if array is None:
-            raise UsageError(f"state: {name!r} is missing; expected {expected}")
-        if array.dtype != dtype or array.shape != shape:
-            raise UsageError(f"state: {name!r} is {array.dtype} {array.shape}; expected {expected}")
-        if not np.isfinite(array).all():
-            raise UsageError(f"state: {name!r} holds a value that is not finite")
-        return np.array(array)
-
-    def end(self) -> None:
-        """Raises UsageError where the state holds what was not asked for."""
-        for name in self._state:
-            if name not in self._read:
-                raise UsageError(f"state: unknown {name!r}{did_you_mean(name, self._read)}")
 
 
 def start_of(step: int, x_hat: Floats, P: Floats, lanes: int, n: int) -> tuple[Vector, Matrix]:

@@ -98,7 +98,7 @@ class ServicesInTime(Services):
         soonest = self._pacing.due_in(self._lead_ns) + 1
         near = self._pacing.due_in(2 * self._lead_ns) + 1
         for entry in list(self.pending):
-            if entry.number in self._talks or (self._needs_service(entry) and not entry.present):
+            if id(entry) in self._talks or (self._needs_service(entry) and not entry.present):
                 continue
             if (entry.step or 0) <= near and not self._must_wait(entry):
                 self._open(entry, max(entry.step or 0, soonest))
@@ -116,13 +116,13 @@ class ServicesInTime(Services):
 
     def lost(self, role: str, reason: str) -> bool:
         entry = self._of(role)
-        talk = None if entry is None else self._talks.get(entry.number)
+        talk = None if entry is None else self._talks.get(id(entry))
         return super().lost(role, reason if talk is None else talk.given_up or reason)
 
     def give_up(self) -> None:
         """The run is over: what has not happened will not."""
         for entry in list(self.pending):
-            if entry.by == "command" or self._collector.finished:
+            if entry.origin.by != "timeline" or self._collector.finished:
                 self._refuse(entry, "the run was over before")
 
     def _ahead(self, now: float, estimated: int) -> float:
@@ -136,7 +136,7 @@ class ServicesInTime(Services):
         place = self.pending.index(entry)
         at = entry.step or self._pacing.due_in(self._lead_ns)
         for i, other in enumerate(self.pending):
-            before = other.number in self._talks or (i < place and (other.step or 0) <= at)
+            before = id(other) in self._talks or (i < place and (other.step or 0) <= at)
             if before and other is not entry and _changed(other) & _used(entry):
                 return True
         return False
@@ -157,13 +157,13 @@ class ServicesInTime(Services):
         new = entry.role.name if entry.role is not None else None
         if plan.promoted is not None:
             new = self._serving(plan.promoted)
-        talk = self._talks[entry.number] = _Talk(entry, step, old, new)
+        talk = self._talks[id(entry)] = _Talk(entry, step, old, new)
         if plan.event.action == "remove":
             self._tell(talk, old, "leave")
         elif old is None:
             self._let_begin(talk)
         else:
-            self._tell(talk, old, "hand", form=plan.handover or "cold", to=new, stop=plan.event.action == "swap")
+            self._tell(talk, old, "hand", form=plan.handover or "cold", to=new, stop=plan.replaces)
 
     def _said(self, role: str, _: str, payload: bytes) -> None:
         """A word of a service."""
@@ -190,25 +190,24 @@ class ServicesInTime(Services):
         if self._collector.completed >= talk.step:
             self._put_off(talk)
         elif talk.entry.plan.promoted is not None:
-            self._tell(talk, talk.new, "serve", name=talk.entry.plan.event.estimator)
+            self._tell(talk, talk.new, "serve", name=talk.entry.plan.name)
         else:
             self._expect(talk)
             self._tell(talk, talk.new, "begin", form=talk.entry.plan.handover or "cold", handed=talk.old is not None)
 
     def _begun(self, talk: _Talk, size: int) -> None:
         """The new one serves."""
-        action = talk.entry.plan.event.action
-        del self._talks[talk.entry.number]
-        if action == "swap" and talk.old is not None:
+        del self._talks[id(talk.entry)]
+        if talk.entry.plan.replaces and talk.old is not None:
             self.leaves(talk.old)
             self._tell(talk, talk.old, "leave")
         self._settle(talk.entry, talk.step, size)
-        if talk.entry.by == "timeline" and talk.step > talk.entry.plan.step:
+        if talk.entry.origin.by == "timeline" and talk.step > talk.entry.plan.step:
             self._say(f"step {talk.step}: {self.happened[-1].text}; it was to be at step {talk.entry.plan.step}")
 
     def _end_at(self, talk: _Talk) -> None:
         """The old one leaves after the step before, and none comes in its place."""
-        del self._talks[talk.entry.number]
+        del self._talks[id(talk.entry)]
         assert talk.old is not None
         self.leaves(talk.old)
         self._count_on(talk.entry, talk.step)
@@ -249,14 +248,14 @@ class ServicesInTime(Services):
         talk.entry.step = talk.step + 1
 
     def _undo(self, talk: _Talk) -> None:
-        del self._talks[talk.entry.number]
+        del self._talks[id(talk.entry)]
         if talk.counted:
             self._take_back(talk)
         if talk.agreed:
             self._tell(talk, talk.old, "stay", to=talk.new)
 
     def _refuse(self, entry: _Pending, reason: str) -> None:
-        talk = self._talks.get(entry.number)
+        talk = self._talks.get(id(entry))
         if talk is not None:
             self._undo(talk)
         super()._refuse(entry, reason)
@@ -272,7 +271,7 @@ class ServicesInTime(Services):
 def _changed(entry: _Pending) -> set[str]:
     """The names whose services another change must not build on while this one is made."""
     plan = entry.plan
-    new = {plan.spec.name} if plan.spec is not None else {plan.event.estimator}
+    new = {plan.name}
     return new | ({plan.promoted} if plan.promoted is not None else set())
 
 

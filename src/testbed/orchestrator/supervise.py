@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+from testbed.errors import UsageError
 from testbed.orchestrator.roles import RoleSpec
 from testbed.scenario import Transport
 
@@ -31,14 +32,43 @@ class Supervisor:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, role: RoleSpec, endpoint: str, run: str, transport: Transport) -> None:
-        """Start a role in a session of its own, so that Ctrl-C reaches only the orchestrator."""
+        """Start a role in a session of its own, so that Ctrl-C reaches only the orchestrator.
+
+        What is left of an earlier process of it is ended before.
+        """
         self._logs.mkdir(exist_ok=True)
         command = [*command_of(role, endpoint, run, transport), "--supervised"]
         environment = {**dict.fromkeys(_ONE_THREAD, "1"), **os.environ}
-        with self.log_of(role.name).open("wb") as log:
+        again = self._forget(role.name)
+        with self.log_of(role.name).open("ab" if again else "wb") as log:
             self._processes[role.name] = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
             )
+
+    def _forget(self, role: str) -> bool:
+        """Whether there was a process of that role; it is no more."""
+        process = self._processes.pop(role, None)
+        if process is None:
+            return False
+        process.kill()
+        process.wait()
+        if process.stdin is not None:
+            process.stdin.close()
+        return True
+
+    def stopped(self, role: str) -> bool:
+        """Whether a role's process is stopped by a signal, as far as the system tells."""
+        try:
+            return Path(f"/proc/{self._processes[role].pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+        except (OSError, KeyError, IndexError):
+            return False
+
+    def signal(self, role: str, number: signal.Signals) -> None:
+        """Send a signal to a role's process. Raises UsageError where there is none."""
+        process = self._processes.get(role)
+        if process is None or process.poll() is not None:
+            raise UsageError(f"{role}: no process of this run")
+        process.send_signal(number)
 
     def log_of(self, role: str) -> Path:
         return self._logs / f"{role}.log"

@@ -48,9 +48,9 @@ class Keys:
         """Where the recorded lanes of what goes over ``key`` are copied to."""
         return f"{self.prefix}/tap/{key[len(self.prefix) + 1 :]}"
 
-    def change(self, link: LinkName) -> str:
-        """Where the orchestrator tells a link of a change."""
-        return f"{self.prefix}/{link}/change"
+    def change(self, part: str) -> str:
+        """Where the orchestrator tells a link, the plant or the controller of a change."""
+        return f"{self.prefix}/{part}/change"
 
     @property
     def ask(self) -> str:
@@ -63,6 +63,19 @@ class Keys:
     def handover(self, role: str) -> str:
         """Ask an estimator's service here to give or take a state, to give the estimates of a name, or to leave."""
         return f"{self.prefix}/handover/{role}"
+
+    def history(self, key: str) -> str:
+        """Ask the sender on ``key`` here for what it has sent since a number."""
+        return f"{self.prefix}/history/{key[len(self.prefix) + 1 :]}"
+
+    @property
+    def begin(self) -> str:
+        """Ask the orchestrator here, with the name of a role, where it begins."""
+        return f"{self.prefix}/begin"
+
+    def state(self, role: str) -> str:
+        """Where a role gives its state now and then."""
+        return f"{self.prefix}/state/{role}"
 
     def told(self, role: str) -> str:
         """Where the orchestrator tells an estimator's service, in real time, what to do after a step to come."""

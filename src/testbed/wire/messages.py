@@ -180,28 +180,39 @@ class ClockMessage(Message):
 
 
 class Command(Message):
-    """An order to all roles. ``stop``: report your counters and leave."""
+    """An order to all roles. ``stop``: report your counters and leave. ``ping``: report that you are there.
+
+    ``forget``: of the packets that you keep for those that begin late, those up to step ``step`` are not needed.
+    """
 
     type: Literal["command"] = "command"
-    action: Literal["stop"]
+    action: Literal["stop", "ping", "forget"]
+    step: Annotated[Count | None, Field(description="with ``forget`` only")] = None
 
 
 class Change(Message):
-    """An order to one link: from step ``step`` on, some keys of its table have other values."""
+    """An order to one link, the plant or the controller: what is other from step ``step`` on."""
 
     type: Literal["change"] = "change"
     step: Count
-    set: Annotated[dict[str, Any], Field(description="keys of the link's table as in a scenario; 'none' removes one")]
+    set: Annotated[
+        dict[str, Any],
+        Field(
+            description="for a link: keys of its table as in a scenario, 'none' removes one; for the plant and the "
+            "controller: the event's table"
+        ),
+    ]
 
 
 class Status(Message):
     """A role's word to the orchestrator."""
 
     type: Literal["status"] = "status"
-    state: Literal["failed", "stopped"]
+    state: Literal["failed", "stopped", "alive"]
     detail: Annotated[str, Field(max_length=2000)] = ""
     counters: dict[str, Count] = {}
     rejected: Annotated[dict[str, Count], Field(description="refused messages by reason")] = {}
+    repeated: Annotated[Count, Field(description="messages that had come before, and were passed over")] = 0
 
 
 MESSAGES: dict[str, type[Message]] = {

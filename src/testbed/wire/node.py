@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable
-from contextlib import ExitStack
+import json
+from collections import Counter, deque
+from collections.abc import Callable, Collection
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
-from testbed.wire.bus import Bus, Publish
+from testbed.errors import RunFailed, UsageError
+from testbed.wire.begin import AT_START, Begin, Given
+from testbed.wire.bundle import bundle
+from testbed.wire.bus import Bus, BusError, Publish
 from testbed.wire.codec import Arrays, Decoder, PacketEncoder, Rejected, Sizes, encode
 from testbed.wire.keys import Keys
-from testbed.wire.messages import Command, Message, Packet, Status
+from testbed.wire.messages import Change, Command, Message, Packet, Status
 
 M = TypeVar("M", bound=Message)
 PacketHandler = Callable[[M, dict[str, NDArray[Any]]], None]
@@ -62,27 +66,59 @@ class Send(Protocol):
     def __call__(self, step: int, lane: int, lanes: int, arrays: Arrays) -> None: ...
 
 
+class Restorable(Protocol):
+    """A service whose blocks of lanes can give their state after a step, and take it back."""
+
+    @property
+    def gives_state(self) -> bool: ...
+
+    def state(self, lane: int) -> bytes: ...
+
+    def resume(self, lane: int, step: int, state: bytes) -> None: ...
+
+
 class Node:
     """What every role has: its name, the run's keys, checked subscriptions, and the count of what it refused.
 
-    tap: number of lanes (from lane 0) of which packets are copied for the recording; 0 for none.
+    tap: number of lanes (from lane 0) of which packets are copied for the recording; 0 for none. begin: where the role
+    begins. every: after so many steps each it gives its state; 0: never. kept: keys of which the role keeps what it
+    sends, for those that begin late, until it is told to forget.
     """
 
-    def __init__(self, bus: Bus, run: str, name: str, sizes: Sizes, tap: int = 0) -> None:
-        self.bus, self.run, self.name, self.sizes = bus, run, name, sizes
+    def __init__(
+        self,
+        bus: Bus,
+        run: str,
+        name: str,
+        sizes: Sizes,
+        tap: int = 0,
+        *,
+        begin: Begin = AT_START,
+        every: int = 0,
+        kept: Collection[str] = (),
+    ) -> None:
+        self.bus, self.run, self.name, self.sizes, self.begin = bus, run, name, sizes, begin
         self.keys = Keys(run)
         self.rejected: Counter[str] = Counter()
+        self.repeated = 0
+        """Messages that had come before."""
         self.stopped = False
         self.payload = b""
         """The message that is being handled."""
         self.leaving = ExitStack()
         """What is to be done when the role leaves."""
         self._tap = tap
-        self._blocks = -(-sizes.lanes // (sizes.lanes_per_packet or sizes.lanes))
+        self._blocks = _blocks(sizes.lanes, sizes)
+        self._from = Gate(begin.step) if begin.step else OPEN
+        self._every, self._service = every, _NO_SERVICE
+        self._keeps, self._sent = frozenset(kept), dict[str, deque[tuple[int, bytes]]]()
+        self._inputs: dict[str, _Input] = {}
+        self._held: list[tuple[_Input, bytes]] | None = [] if begin.late else None
         self._status_seq = 0
         self._status = bus.publisher(self.keys.status(name))
         if name != ORCHESTRATOR:
-            self.on(self.keys.command, Command, ORCHESTRATOR, self._obey)
+            self._give = bus.publisher(self.keys.state(name), lazy=True) if every else None
+            self.on(self.keys.command, Command, ORCHESTRATOR, self._obey, first=None)
 
     def sender(
         self, key: str, model: type[Packet], *, tap: bool = False, lazy: bool = False, gate: Gate = OPEN
@@ -93,11 +129,14 @@ class Node:
         not send, or that somebody else sent, and that count in the numbers.
         """
         encoder = PacketEncoder(model, self.run, self.name)
-        send = _numbered(self.bus.publisher(key, lazy=lazy), encoder, gate, self._blocks)
+        gate = self._from if gate is OPEN else gate
+        kept = self._keep(key) if key in self._keeps else None
+        send = _numbered(self.bus.publisher(key, lazy=lazy), encoder, gate, self._blocks, kept)
         if not tap or not self._tap or self._tap >= self.sizes.lanes:
             return send
         encoder = PacketEncoder(model, self.run, self.name)
-        copy = _numbered(self.bus.publisher(self.keys.tap(key), lazy=True), encoder, OPEN, 0)
+        blocks = _blocks(self._tap, self.sizes)
+        copy = _numbered(self.bus.publisher(self.keys.tap(key), lazy=True), encoder, self._from, blocks, None)
         recorded = self._tap
 
         def send_both(step: int, lane: int, lanes: int, arrays: Arrays) -> None:
@@ -119,23 +158,32 @@ class Node:
         last: int | None = None,
         cut: bool = False,
         gate: Gate = OPEN,
+        first: int | None = 0,
     ) -> None:
         """Call ``handler(header, arrays)`` for each valid message of ``source`` on ``key``; count the others.
 
-        Packets come as the run splits the lanes, and the steps of each block one after the other.
+        Packets come as the run splits the lanes, and the steps of each block one after the other. What has come before
+        with the same number is passed over and counted: a role that was started anew sends it again.
 
         source: the role that sends here, or what says of a header whether its sender is right. needs: arrays that a
         packet must have here. last: the last step, where it is not that of the run. cut: packets hold the recorded
         lanes only. gate: the packets that are passed over at first; the first that is taken has the number that it
-        must have had all before it come, or follows on the one that was seen before.
+        must have had all before it come, or follows on the one that was seen before. first: the number of the first
+        message that is no packet; None: any, as in a role that begins late.
         """
         sizes = self.sizes if last is None else replace(self.sizes, steps=last)
+        gate = self._from if gate is OPEN else gate
         decoder, turns = Decoder(model, self.run, sizes), _Turns(None if cut else sizes.lanes_per_packet, sizes.lanes)
         is_source = source if callable(source) else partial(_is_from, source)
-        expected = 0 if gate.passed_over == 0 else None
+        is_packet = issubclass(model, Packet)
+        if is_packet:
+            first = 0 if gate.passed_over == 0 else None
+        elif self.begin.late:
+            first = 0 if model is Change else None
+        due = self._inputs[key] = _Input(key, first, of_changes=model is Change)
+        blocks = _blocks(self._tap, self.sizes) if cut else None
 
-        def receive(key: str, payload: bytes) -> None:
-            nonlocal expected
+        def receive(payload: bytes) -> None:
             for message, outcome in decoder.read(payload):
                 try:
                     if isinstance(outcome, Rejected):
@@ -144,19 +192,25 @@ class Node:
                     early = False
                     if gate is not OPEN and isinstance(header, Packet):
                         if gate.passed_over is None:
-                            if not gate.keeps(header, partial(receive, key, message)):
-                                expected = header.seq + 1
+                            if not gate.keeps(header, partial(receive, message)):
+                                due.number = header.seq + 1
                             continue
                         early = header.step - header.FIRST_STEP < gate.passed_over
-                        first = turns.begin(gate.passed_over)
-                        if expected is None:
-                            expected = header.seq if early else first
+                        begun = turns.begin(gate.passed_over, blocks)
+                        if due.number is None:
+                            due.number = header.seq if early else begun
+                    elif due.number is None and is_source(header):
+                        due.number = header.seq
                     if not is_source(header):
                         raise Rejected("source", f"from {header.source}")
-                    if header.seq != expected:
-                        raise Rejected("sequence", f"number {header.seq}, expected {expected}")
+                    if due.number is not None and header.seq < due.number:
+                        self.repeated += 1
+                        continue
+                    if header.seq != due.number:
+                        raise Rejected("sequence", f"number {header.seq}, expected {due.number}")
                     if early:
-                        expected += 1
+                        turns.check_early(header)
+                        due.number += 1
                         continue
                     for name in needs:
                         if name not in arrays:
@@ -166,11 +220,84 @@ class Node:
                 except Rejected as refusal:
                     self.rejected[refusal.reason] += 1
                     continue
-                expected += 1
+                due.number += 1
                 self.payload = message
                 handler(header, arrays)
 
-        self.bus.subscribe(key, receive)
+        def hold(_: str, payload: bytes) -> None:
+            if self._held is None:
+                receive(payload)
+            else:
+                self._held.append((due, payload))
+
+        def take(_: str, payload: bytes) -> None:
+            receive(payload)
+
+        due.receive = receive
+        self.bus.subscribe(key, hold if self._held is not None and is_packet and not cut else take)
+
+    def serve(self, service: object) -> None:
+        """Say what service this is the node of; where it begins with a state, it is given that.
+
+        Before that it is told of the changes that were made.
+        """
+        for due in self._inputs.values():
+            if due.of_changes:
+                for message in self.begin.changes:
+                    due.receive(message)
+        if getattr(service, "gives_state", False):
+            self._service = service  # type: ignore[assignment]
+            for lane, state in self.begin.states.items():
+                self._service.resume(lane, self.begin.step, state)
+
+    def done(self, step: int, lane: int) -> None:
+        """A block of lanes has done a step, and sent everything of it: give its state if it is time for that."""
+        if self._every and not step % self._every and self._service is not _NO_SERVICE and self._give is not None:
+            given = Given(role=self.name, step=step, lane=lane, life=self.begin.life)
+            self._give(given.with_data(self._service.state(lane)))
+
+    def catch_up(self) -> None:
+        """Of a role that begins late: take what was sent before it listened, and then what has come since.
+
+        Raises RunFailed where that is not there any more.
+        """
+        if self._held is None:
+            return
+        told = [(due, payload) for due in self._inputs.values() for payload in self._history_of(due)]
+        self.bus.call(partial(self._work_off, told))
+
+    def _history_of(self, due: _Input) -> list[bytes]:
+        """What the sender on a key has sent since this role's beginning; nothing where nobody keeps it."""
+        if due.key not in self._keeps:
+            return []
+        since = self.begin.step * self._blocks
+        with suppress(BusError):
+            answer = self.bus.ask(self.keys.history(due.key), json.dumps({"since": since}).encode())
+            if answer[:1] == b"{":
+                raise RunFailed(f"{due.key}: {json.loads(answer)['error']}")
+            return [answer] if answer else []
+        return []
+
+    def _work_off(self, told: list[tuple[_Input, bytes]]) -> None:
+        held, self._held = self._held or [], None
+        for due, payload in [*told, *held]:
+            due.receive(payload)
+
+    def _keep(self, key: str) -> deque[tuple[int, bytes]]:
+        if key not in self._sent:
+            self._sent[key] = deque()
+            self.bus.answer(self.keys.history(key), partial(self._told, self._sent[key]))
+        return self._sent[key]
+
+    def _told(self, sent: deque[tuple[int, bytes]], question: bytes) -> bytes:
+        try:
+            since = int(json.loads(question)["since"])
+        except (ValueError, KeyError, TypeError):
+            return json.dumps({"error": "a question that is not understood"}).encode()
+        if sent and sent[0][0] > since:
+            return json.dumps({"error": f"kept from number {sent[0][0]} on, asked for {since}"}).encode()
+        messages = [message for seq, message in sent if seq >= since]
+        return bundle(messages) if messages else b""
 
     def announce(self) -> None:
         """Say that this role is ready: all its subscriptions are declared."""
@@ -186,13 +313,46 @@ class Node:
             detail=detail[:2000],
             counters=counters,
             rejected=dict(self.rejected),
+            repeated=self.repeated,
         )
         self._status_seq += 1
         self._status(encode(status))
 
+    def expect_anew(self, key: str) -> None:
+        """The sender of messages that are no packets is started anew, and counts them from 0."""
+        self._inputs[key].number = 0
+
     def _obey(self, command: Command, _: dict[str, NDArray[Any]]) -> None:
         if command.action == "stop":
             self.stopped = True
+        elif command.action == "ping":
+            self.report("alive", {})
+        else:
+            before = (command.step or 0) * self._blocks
+            for sent in self._sent.values():
+                while sent and sent[0][0] < before:
+                    sent.popleft()
+
+
+class _Input:
+    """What is due on a key that a role listens to: the number of the next message, None until the first has come."""
+
+    def __init__(self, key: str, number: int | None, *, of_changes: bool) -> None:
+        self.key, self.number, self.of_changes = key, number, of_changes
+        self.receive: Callable[[bytes], None] = lambda payload: None
+
+
+class _NoService:
+    gives_state = False
+
+    def state(self, lane: int) -> bytes:
+        raise UsageError("there is no service")
+
+    def resume(self, lane: int, step: int, state: bytes) -> None:
+        raise UsageError("there is no service")
+
+
+_NO_SERVICE: Restorable = _NoService()
 
 
 class _Turns:
@@ -203,10 +363,19 @@ class _Turns:
         self._due: dict[int, int] = {}
         self._passed_over = 0
 
-    def begin(self, passed_over: int) -> int:
-        """Let so many packets of each block be done; the number of the next one on the key, where all are done."""
+    def begin(self, passed_over: int, blocks: int | None = None) -> int:
+        """Let so many packets of each block be done; the number of the next one on the key, where all are done.
+
+        blocks: how many there are, where not all lanes come.
+        """
         self._passed_over = passed_over
-        return passed_over * len(range(0, self._lanes, self._per_packet or self._lanes))
+        every = len(range(0, self._lanes, self._per_packet or self._lanes))
+        return passed_over * (every if blocks is None else blocks)
+
+    def check_early(self, packet: Message) -> None:
+        """Of a packet from before the beginning: none of its block from behind it has come."""
+        if isinstance(packet, Packet) and packet.lane in self._due:
+            raise Rejected("order", f"step {packet.step}, expected {self._due[packet.lane]}")
 
     def check(self, packet: Packet) -> None:
         lane, size = packet.lane, self._per_packet
@@ -224,14 +393,24 @@ def _is_from(source: str, header: Message) -> bool:
     return header.source == source
 
 
-def _numbered(publish: Publish, encoder: PacketEncoder, gate: Gate, blocks: int) -> Send:
+def _blocks(lanes: int, sizes: Sizes) -> int:
+    """Packets of a step that hold the first so many lanes."""
+    return -(-lanes // (sizes.lanes_per_packet or sizes.lanes))
+
+
+def _numbered(
+    publish: Publish, encoder: PacketEncoder, gate: Gate, blocks: int, kept: deque[tuple[int, bytes]] | None
+) -> Send:
     seq = 0 if gate.passed_over == 0 else -1
 
     def send(step: int, lane: int, lanes: int, arrays: Arrays) -> None:
         nonlocal seq
         if seq < 0:
             seq = (gate.passed_over or 0) * blocks
-        publish(encoder.encode(seq, step, lane, lanes, arrays))
+        message = encoder.encode(seq, step, lane, lanes, arrays)
+        if kept is not None:
+            kept.append((seq, message))
+        publish(message)
         seq += 1
 
     return send

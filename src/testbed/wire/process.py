@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from testbed.errors import TestbedError
 from testbed.scenario import Transport
+from testbed.wire.begin import Begin
 from testbed.wire.bus import BusError
 from testbed.wire.keys import Keys
 from testbed.wire.node import ORCHESTRATOR, Node
@@ -58,15 +59,16 @@ def serve(options: argparse.Namespace, name: str, build: Build) -> int:
 
 
 def _serve(bus: ZenohBus, run: str, name: str, build: Build) -> int:
-    orphaned = threading.Event()
+    orphaned, keys = threading.Event(), Keys(run)
     try:
-        setup = Setup.from_json(bus.ask(Keys(run).scenario))
+        setup = Setup.from_json(bus.ask(keys.scenario))
+        begin = Begin.from_bytes(bus.ask(keys.begin, name.encode()))
     except BusError as error:
         return _refuse(str(error))
     bus.express, bus.timed = setup.express, setup.real
     if setup.real:
         wake_on_time()
-    node = Node(bus, run, name, setup.sizes, setup.copied)
+    node = setup.join(bus, name, begin)
     bus.direct = setup.direct
     with node.leaving:
         return _play(bus, node, setup, build, orphaned)
@@ -77,11 +79,13 @@ def _play(bus: ZenohBus, node: Node, setup: Setup, build: Build, orphaned: threa
     name = node.name
     try:
         role = build(node, setup)
+        node.serve(role)
         bus.watch(node.keys.presence(ORCHESTRATOR), lambda _, alive: None if alive else orphaned.set())
         if setup.transport.shared_memory:
             bus.publisher(node.keys.warm(name))(bytes(_WARM))
         settle_memory()
         node.announce()
+        node.catch_up()
         with np.errstate(all="ignore"):  # what is not finite is looked for where it would leave a role
             while not node.stopped and not orphaned.is_set():
                 bus.run(_POLL_S)

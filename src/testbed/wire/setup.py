@@ -6,11 +6,17 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, get_args
 
 from testbed.scenario import ClosedLoop, Scenario, Transport, parse_scenario, to_toml
 from testbed.scenario.backend import real_links
+from testbed.scenario.estimator_events import AcksEvent
+from testbed.scenario.estimators import NewService
+from testbed.scenario.events import Event, KillEvent, RestartEvent
+from testbed.wire.begin import AT_START, Begin
+from testbed.wire.bus import Bus
 from testbed.wire.codec import Sizes
+from testbed.wire.keys import Keys, LinkName
 from testbed.wire.node import Node
 
 _WINDOW_MAX = 256
@@ -21,6 +27,8 @@ _BYTES_BEHIND = 1_000_000  # less than what waits for a process that has stopped
 _MESSAGE_OVERHEAD = 250  # bytes
 _AHEAD_NS = 500_000_000
 _DIRECT_MAX = 8_192  # bytes
+_KEPT_BYTES = 64_000_000
+_KEPT_STEPS = 2_000
 _SHARED_MIN = 65_536  # bytes of the largest packet from which shared memory pays
 
 
@@ -30,6 +38,8 @@ class Setup:
 
     run: str
     scenario: Scenario
+    single: bool = False
+    """Whether everything is in one process, none of which can be lost unless that is asked for."""
 
     @cached_property
     def sizes(self) -> Sizes:
@@ -132,12 +142,44 @@ class Setup:
         s = self.scenario
         specs = [*s.estimators, *(planned.spec for planned in s.swaps)]
         told = any(spec is not None and spec.acks == "perfect" for spec in specs)
+        told = told or any(_asks_for_acks(event) for event in s.events if not event.timed)
         return s.links.ack.mode != "none" or s.record != "none" or told
 
     @property
     def costs_input(self) -> bool:
         """Whether the collector needs the input that was applied."""
         return self.scenario.cost is not None and self.sizes.q > 0
+
+    @cached_property
+    def snapshot_every(self) -> int:
+        """Steps from one snapshot of a role to the next; 0: none."""
+        recovery = self.scenario.recovery
+        ended = any(isinstance(event, KillEvent | RestartEvent) for event in self.scenario.events)
+        if recovery.nothing_kept or (self.single and not (recovery.asked or ended)):
+            return 0
+        return recovery.every or max(8, min(_KEPT_STEPS, _KEPT_BYTES // self._bytes_a_step))
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Keys on which senders keep what they sent for roles that are started anew: those that roles listen to."""
+        if not self.snapshot_every:
+            return ()
+        keys = Keys(self.run)
+        links = get_args(LinkName)
+        source = self.scenario.input
+        followed = (keys.estimate(source.estimator),) if isinstance(source, ClosedLoop) else ()
+        return (*map(keys.sent, links), *map(keys.delivered, links), *followed)
+
+    @property
+    def _bytes_a_step(self) -> int:
+        """Of all that links take and deliver, an estimate."""
+        return 2 * (8 * self.scenario.lanes * (self.sizes.q + self.sizes.p + 1) + 3 * _MESSAGE_OVERHEAD)
+
+    def join(self, bus: Bus, name: str, begin: Begin = AT_START) -> Node:
+        """The node of a role."""
+        return Node(
+            bus, self.run, name, self.sizes, self.copied, begin=begin, every=self.snapshot_every, kept=self.kept
+        )
 
     def to_json(self) -> bytes:
         return json.dumps({"run": self.run, "scenario": to_toml(self.scenario)}).encode()
@@ -146,6 +188,14 @@ class Setup:
     def from_json(cls, payload: bytes) -> Setup:
         data = json.loads(payload)
         return cls(data["run"], parse_scenario(data["scenario"]))
+
+
+def _asks_for_acks(event: Event) -> bool:
+    """Whether an estimator may be told of every control packet after an event that waits."""
+    if isinstance(event, AcksEvent):
+        return event.acks == "perfect"
+    to = getattr(event, "to", None)
+    return isinstance(to, NewService) and to.acks == "perfect"
 
 
 class Role(Protocol):

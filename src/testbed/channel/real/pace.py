@@ -18,7 +18,7 @@ Handler = Callable[[Any, Arrays], None]
 
 
 class Pace:
-    """A handler of packets that lets packet i = 0, 1, … through no earlier than i periods after packet 0.
+    """A handler of packets that lets packet i + j through no earlier than j periods after packet i, the first to come.
 
     behind: packets that came through more than a period after their turn.
     """
@@ -38,7 +38,8 @@ class Pace:
         """Those whose turn has come; for the next one, come back."""
         queue, now_ns = self._queue, time.monotonic_ns()
         if self._start_ns is None:
-            self._start_ns = now_ns
+            first, _, _ = queue[0]
+            self._start_ns = now_ns - (first.step - first.FIRST_STEP) * self._period_ns
         while queue:
             packet, arrays, message = queue[0]
             turn_ns = self._start_ns + (packet.step - packet.FIRST_STEP) * self._period_ns

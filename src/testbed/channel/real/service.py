@@ -101,6 +101,11 @@ class RealLinkService:
         around |= {f"{where}_{key}": count for where, counts in books.items() for key, count in counts.items()}
         return {**total, **{f"real_{key}": count for key, count in around.items()}}
 
+    @property
+    def gives_state(self) -> bool:
+        """What is under way is in sockets, and cannot be given."""
+        return False
+
     def _note(self, change: Change, _: dict[str, NDArray[Any]]) -> None:
         """Take an order to change from a step on that is still to come; the orchestrator has checked it."""
         self._changes.append((change.step, change.set))

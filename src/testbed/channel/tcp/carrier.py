@@ -87,12 +87,16 @@ class TcpCarrier:
             times.append(self._got[0][0])
         return min(times, default=None)
 
+    @property
+    def under_way(self) -> set[int]:
+        numbers = [self._got, self._ends]
+        return {number for pairs in numbers for _, number in pairs} | {number for number, _ in self._waiting}
+
     def change(self, settings: Impairments) -> None:
         """Other impairments from now on: forwards these, backwards those of `back`, or else these too."""
         forward, backward = self._pipelines[:2]
         forward.change(settings)
-        back = settings.back if isinstance(settings, SteppedImpairments) else None
-        backward.change(back or settings)
+        backward.change(settings.backwards if isinstance(settings, SteppedImpairments) else settings)
 
     def as_counters(self) -> dict[str, int]:
         """What the connections did so far."""
