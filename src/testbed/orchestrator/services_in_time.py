@@ -28,6 +28,8 @@ _LEAD_NS = 50_000_000
 _LEAD_STEPS = 3
 _PATIENCE_S = 1.0
 """So long after its step a service that has not begun is given up; the estimates are late until then."""
+_SPARE = 8
+"""Services that are started before the run begins, so many at most."""
 _WATCHED = 10
 """Estimates after a change whose lateness is told."""
 
@@ -70,8 +72,10 @@ class ServicesInTime(Services):
             self._listen(turns[0].role)
 
     def all_are_there(self) -> bool:
-        """Whether the services are there, or refused, that would be launched in the first moment of the run."""
-        self._launch_due(0, 0)
+        """Whether the services of the first changes are there, or refused; started later they take time from others."""
+        for entry in list(self.pending[:_SPARE]):
+            if entry.launched_s is None and self._needs_service(entry):
+                self._launch(entry, time.monotonic())
         return all(entry.present for entry in self.pending if entry.launched_s is not None)
 
     def deciding(self, role: str) -> bool:
