@@ -7,11 +7,14 @@ from typing import Any
 
 import pytest
 
-from orchestrator.resuming import Whole, check_resumed, packets_of, whole_run
+from orchestrator.resuming import Whole, check_resumed, live, packets_of, whole_run
 from orchestrator.runs import MARKOV, scenario
 from orchestrator.test_late import LINKS as LATE
 from orchestrator.test_robust import scenario as robust
 from orchestrator.test_swaps import able, swap
+from orchestrator.wall_clock import Simulated
+from testbed.errors import UsageError
+from testbed.wire.state import pack
 
 STEPS = 20
 SPLIT = {"transport": {"lanes_per_packet": 4}}
@@ -47,6 +50,12 @@ CASES: dict[str, dict[str, Any]] = {
     "hold": {"actuator": {"on_loss": "hold"}, "cost": {"Qx": [[1.0, 0.0], [0.0, 1.0]]}},
     "correlated": {"links": {"control": {"loss": MARKOV}}},
     "changed": {"events": CHANGED},
+    "drift": {
+        "events": [
+            {"at": 3, "action": "plant", "A": [[0.9, 0.1], [0.0, 0.5]], "R": [[0.8]], "over": 8},
+            {"at": 10, "action": "input", "input": {"kind": "constant", "value": [2.0]}},
+        ]
+    },
 }
 
 
@@ -55,7 +64,7 @@ def test_every_service_goes_on_to_the_same_bits(case: str, tmp_path: Path) -> No
     changes = CASES[case]
     specs = able(**changes)
     assert len(specs) >= (2 if case == "hold" else 8)
-    if "late" in case:
+    if "late" in case or case == "slots":
         specs = [spec for spec in specs if spec["name"] in ("aoe", "gpb", "kfio", "oe", "pf")]
         specs += [{"name": "acked", "kind": "aoe"}, {"name": "short", "kind": "gpb", "order": 1, "buffer": 2}]
     run = whole_run(scenario(**GIVEN, **changes, estimators=specs), tmp_path, 3 if case == "schedule" else None)
@@ -103,3 +112,41 @@ def test_services_that_joined_go_on_under_the_names_that_they_have(tmp_path: Pat
     assert set(begins.values()) == {1, 4, 5, 13}
     assert set(ends.values()) == {3, 10, 12, STEPS}
     check(run, 1, 2, 4, 8, 9, 12, 14, 17)
+
+
+def in_real_time(tmp_path: Path, **changes: Any) -> Whole:
+    clock = {"mode": "real", "period": "10 ms"}
+    given = scenario(**GIVEN, **SPLIT, **changes, clock=clock, estimators=[{"name": "aoe", "acks": "none"}])
+    return whole_run(given, tmp_path, network=Simulated)
+
+
+def test_in_real_time_a_controller_without_feedback_sends_the_same(tmp_path: Path) -> None:
+    run = in_real_time(tmp_path)
+    for step in (1, 8, 19):
+        check_resumed(run.lives["controller"], run.setup, "controller", run.messages, step, network=Simulated)
+
+
+def test_in_real_time_a_controller_knows_again_what_it_knew(tmp_path: Path) -> None:
+    """What it sends then depends on when estimates come; its state says all that it knows."""
+    source = {"kind": "pid", "kp": 0.3, "ki": 0.1, "kd": 0.2, "high": 1.5, "estimator": "aoe"}
+    run = in_real_time(tmp_path, input=source)
+    life = run.lives["controller"]
+    for step in (1, 8, 19):
+        again = live(life, run.setup, "controller", [], step, life.states[step], Simulated)
+        assert {lane: again.service.state(lane) for lane in life.states[step]} == life.states[step]
+
+
+def test_a_controller_without_a_state_gives_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "stateless.py").write_text(
+        "class Plain:\n"
+        "    def __init__(self, model, lanes):\n        pass\n\n"
+        "    def step(self, k, x_hat, P):\n        return -0.1 * x_hat[:, :1]\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    source = {"kind": "python", "controller": "stateless:Plain", "estimator": "aoe"}
+    run = whole_run(scenario(**GIVEN, input=source, estimators=[{"name": "aoe", "acks": "none"}]), tmp_path / "out")
+    life = run.lives["controller"]
+    assert not life.service.gives_state
+    assert not life.states
+    with pytest.raises(UsageError, match="set_state"):
+        life.service.resume(0, 3, pack({}, step=3))

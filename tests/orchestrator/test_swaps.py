@@ -603,10 +603,3 @@ def test_the_statement_on_an_lqg_controller_knows_of_swaps() -> None:
         found = statement(scenario(input=loop, events=events))
         assert found is not None
         assert found.startswith(text)
-
-
-def test_real_time_does_not_wait_for_an_estimator() -> None:
-    events = [{"at": 3, "action": "swap", "estimator": "aoe", "to": {"kind": "kfio"}, "handover": "cold"}]
-    with pytest.raises(UsageError) as refusal:
-        scenario(clock={"mode": "real"}, events=events)
-    assert str(refusal.value).startswith("scenario: events[0].action: got 'swap' with clock mode 'real'")

@@ -97,7 +97,7 @@ class LinkService:
 
     Its state, on a link that takes no time: the state of the loss process and the counts. On one that does: the
     contents under way, and the rest is worked out again from packet 0 on, since fates do not depend on contents; that
-    takes as long as the link took with them, about @@ µs a packet and lane without a transport, @@ µs with tcp.
+    takes as long as the link took with them, about 10 µs a packet and lane without a transport, 40 µs with tcp.
     """
 
     def __init__(self, node: Node, setup: Setup, *, link: LinkName) -> None:

@@ -91,14 +91,20 @@ class Collector:
     def expect(self, name: str, first: int, last: int) -> None:
         """Let the estimates of a name be due until step ``last``, and of a new one from ``first`` on.
 
-        What is granted already must not change by it.
+        What is complete already must not change by it.
         """
         if name not in self._until:
             self._first[name], self._words[name] = first, f"estimate of {name}"
             self.estimators[name] = series = self._new_series()
             series.begin_at(first, self.completed)
         self._until[name] = last
-        self._plan()
+        self._plan_again()
+
+    def forget(self, name: str) -> None:
+        """Let a name that was to have estimates, and has none yet, have none."""
+        for of in (self._first, self._until, self._words, self.estimators):
+            of.pop(name)
+        self._plan_again()
 
     @property
     def finished(self) -> bool:
@@ -316,6 +322,19 @@ class Collector:
         self._ends = sorted({*self._until.values(), *begins, self._bounds_until, self._count})
         self._parts = [self._parts_at(end) for end in self._ends]
 
+    def _plan_again(self) -> None:
+        """What each step consists of, those included of which something has come."""
+        self._plan()
+        for step, record in self._steps.items():
+            parts, _ = self._parts_at(step)
+            for part in record.parts ^ parts:
+                missing = sum((lane, part) not in record.come for lane in self._blocks)
+                change = missing if part in parts else -missing
+                record.outstanding += change
+                record.gate += change
+            record.parts = parts
+        self._advance()
+
     def _done(self, record: _Step, lane: int, part: str) -> None:
         record.come.append((lane, part))
         record.outstanding -= 1
@@ -323,6 +342,7 @@ class Collector:
             self._advance()
 
     def _advance(self) -> None:
+        """To the first step of which something has not come."""
         steps = self._steps
         while (following := steps.get(self.completed + 1)) is not None and not following.outstanding:
             self.completed += 1

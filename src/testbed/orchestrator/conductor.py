@@ -20,12 +20,13 @@ from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.recovery import Recovery
 from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Services
+from testbed.orchestrator.services_in_time import ServicesInTime
 from testbed.orchestrator.summary import Happened
 from testbed.orchestrator.timeline import Timeline
 from testbed.orchestrator.watchdog import Watchdog
 from testbed.plant.service import ROLE as PLANT
 from testbed.scenario.recovery import Policy
-from testbed.wire.begin import AT_START
+from testbed.wire.begin import AT_START, Begin
 from testbed.wire.bus import Bus
 from testbed.wire.codec import Rejected, encode
 from testbed.wire.keys import LinkName
@@ -80,31 +81,41 @@ class Conductor:
         roles: Sequence[RoleSpec],
         recorder: Recorder | None,
         policies: Mapping[str, Policy] | None = None,
+        begin: int = 0,
     ) -> None:
-        """policies: what becomes of a role that is lost; of one that is not among them, the run fails."""
+        """policies: what becomes of a role that is lost; of one that is not among them, the run fails.
+
+        begin: the step after which the run goes on.
+        """
         self.setup, self.collector = setup, Collector(setup)
         self.failure: str | None = None
         self.reports: dict[str, Status] = {}
-        self.stop_asked = False
-        """Somebody outside asked for the end."""
+        self.stop_asked = ""
+        """Why the run is to end before its end; empty: nobody asked for it."""
         self.activity = 0
         """Grows with every message that was of use."""
         self.on_started: Callable[[], None] = lambda: None
+        self.on_progress: Callable[[], None] = lambda: None
+        """Called when all roles are there, when steps are complete, and when events are decided."""
         self.say: Callable[[str], None] = lambda line: None
         self._roles = [role.name for role in roles]
         self._present: set[str] = set()
         self._gone: list[str] = []
         """Roles that have left as they should."""
-        self._begun = False
+        self._begun = self._going = False
         self._granted = 0
+        self._told = 0
         self._steps, self._credit = setup.scenario.steps, setup.credit
         self._stopping = False
         self._recorder = recorder
-        self.node = setup.join(bus, ORCHESTRATOR)
+        self.recorded: list[str] = []
+        """The topics of the links that are recorded."""
+        self.node = setup.join(bus, ORCHESTRATOR, Begin(begin))
         self._commands = 0
         self._command = bus.publisher(self.node.keys.command)
         self.pacing = Pacing(bus, setup, self.collector, self._grant, self.fail) if setup.real else None
-        self.services = Services(bus, setup, self.collector, lambda line: self.say(line))
+        parts = bus, setup, self.collector, lambda line: self.say(line)
+        self.services = Services(*parts) if self.pacing is None else ServicesInTime(*parts, self.pacing)
         self.timeline = Timeline(bus, setup, self.collector, self.services, lambda line: self.say(line))
         self._clock = bus.publisher(self.node.keys.clock)  # behind the others: what is held back is sent in this order
         self._clock_seq = 0
@@ -114,6 +125,8 @@ class Conductor:
         self.recovery.forget = lambda step: self._order("forget", step)
         self.recovery.changes = lambda role: self.timeline.told_to(role.removeprefix("link."))
         self.recovery.missed, self.recovery.rejected = self._missed, self.node.rejected
+        self.services.retry, self.services.comes_back = self._advance_soon, self._comes_back
+        self.services.taken, self.services.served = self.recovery.taken, self.recovery.served
         self.ending: Callable[[str], str | None] = lambda role: None
         """How a role's process has ended, if it has."""
         self.watchdog = Watchdog(setup, self.collector, lambda: self._order("ping"))
@@ -135,6 +148,23 @@ class Conductor:
         return self.collector.finished or self.failure is not None
 
     @property
+    def granted(self) -> int:
+        """The last step that the clock has let begin."""
+        return self._granted
+
+    @property
+    def resting(self) -> bool:
+        """Whether everything is done up to the step at which the clock is held."""
+        held = self.timeline.held_at
+        return self._begun and held is not None and self.collector.completed >= held
+
+    @property
+    def held_at(self) -> int | None:
+        """The step beyond which the clock does not go, and that it has reached; None where it goes on."""
+        held = self.timeline.held_at
+        return self._granted if held is not None and self._granted >= held else None
+
+    @property
     def missing(self) -> list[str]:
         """Roles that are not there."""
         return [role for role in self._roles if role not in self._present]
@@ -149,6 +179,10 @@ class Conductor:
         if self.started and self.services.pending and self.collector.estimated == self._granted:
             return f"a service of {self.services.pending[0].plan.event.estimator} to join"
         return self.collector.awaiting() if self.started else f"roles to join: {', '.join(self.missing)}"
+
+    def outcome(self, number: int) -> Happened | None:
+        """What became of an order; None as long as that is to come."""
+        return next((e for e in self.timeline.happened(self._granted + 1) if e.number == number), None)
 
     def change_link(self, link: str, change: dict[str, Any]) -> int:
         """Let keys of a link have other values from the next step on that is not granted yet; that step.
@@ -177,16 +211,31 @@ class Conductor:
         return number
 
     def hold(self, step: int) -> None:
-        """Let the clock not go beyond a step, or beyond what is granted already. Raises UsageError in real time."""
-        if self.pacing is not None:
+        """Let the clock not go beyond a step, or beyond what is granted already.
+
+        Raises UsageError in real time, but for step 0 before it begins.
+        """
+        if self.pacing is not None and (step or self._going):
             raise UsageError("the run keeps real time, which cannot be held; allowed: in virtual time")
         self.timeline.held_at = step
+        self._go()
 
     def release(self) -> None:
         """Let the clock go on."""
         self.timeline.held_at = None
-        if self.started:
-            self._advance()
+        self._go()
+
+    def _go(self) -> None:
+        """Begin, unless the clock is held at the beginning, or go on."""
+        if not self._begun or self._stopping:
+            return
+        if not self._going and self.timeline.held_at != 0:
+            self._going = True
+            self.on_started()
+            if self.pacing is not None:
+                self.pacing.begin()
+                self.timeline.begin_real(self.node.bus.clock.monotonic_of(self.pacing.times.start_ns))
+        self._advance()
 
     def _check_going(self) -> None:
         if self.over or self._granted >= self._steps:
@@ -203,7 +252,7 @@ class Conductor:
             if asked.event is not None:
                 return json.dumps({"number": self.order(asked.event)}).encode()
             if asked.do == "stop":
-                self.stop_asked = True
+                self.end("stopped by command")
             elif asked.do == "hold":
                 self.hold(asked.step if asked.step is not None else self._granted)
             elif asked.do == "release":
@@ -218,7 +267,7 @@ class Conductor:
         """How far the run is, who estimates, and what has happened."""
         at = self._granted
         future = [e for e in self.timeline.happened(self._steps) if e.step > at + 1 and e.by != "timeline"]
-        roles = {name: self.services.role_at(name, at) for name in self.services.turns}
+        roles = {name: self.services.role_at(name, max(at, 1)) for name in self.services.turns}
         return {
             "completed": self.collector.completed,
             "granted": at,
@@ -242,18 +291,24 @@ class Conductor:
         """From time to time: launch what will be needed, and give up what does not come."""
         if self.started and not self.over:
             self.recovery.proceed()
-            busy = bool(self.recovery.down) or self.timeline.held_at is not None
+            busy = bool(self.recovery.down) or self.resting
             for role in self.watchdog.hung(self._present - {role for role in self._present if self._fails(role)}, busy):
                 self._is_lost(role, f"gave no sign of life for {self.watchdog.patience_s:g} s")
-        if self.timeline.held_at is not None:
+        if self.resting:
             self.activity += 1  # who holds the clock knows that nothing moves
-        if self.timeline.pending and self.started and not self.over:
+        if self.timeline.pending and not self.over:
             if self.services.overdue(deadline_s):
                 self.activity += 1
-            self._advance()
+            if self.started:
+                self._advance()
+                self.on_progress()
+            else:
+                self._begin()
 
     def ended(self, role: str, how: str) -> None:
         """A role's process has ended; fail unless it has reported, can be recovered, or was not in charge yet."""
+        if self.services.deciding(role):
+            return  # what it has sent comes before the news that it is gone
         if role not in self.reports and role not in self._gone:
             self.recovery.down.pop(role, None)
             self._is_lost(role, f"ended: {how}")
@@ -263,6 +318,10 @@ class Conductor:
         if self.recovery.policy(role) != "restart":
             raise UsageError(f"{role} cannot be started anew: its policy of recovery is {self.recovery.policy(role)}")
         self._is_lost(role, "was restarted")
+
+    def end(self, reason: str) -> None:
+        """Somebody asks for the end before the end; the first reason stays."""
+        self.stop_asked = self.stop_asked or reason
 
     def stop(self) -> None:
         """Tell all roles to report and leave."""
@@ -337,6 +396,7 @@ class Conductor:
             return False
         self.activity += 1
         self._advance()
+        self.on_progress()
         return True
 
     def _listen(self, role: str) -> None:
@@ -347,8 +407,34 @@ class Conductor:
 
     def _begin_of(self, role: bytes) -> bytes:
         name = role.decode(errors="replace")
-        late = self.started and name in self.recovery.specs
-        return (self.recovery.begin(name, late=True) if late else AT_START).to_bytes()
+        known = name in self.recovery.specs
+        return (self.recovery.begin(name, late=self.started) if known else AT_START).to_bytes()
+
+    def begin_after(self, step: int, reports: Mapping[str, Status]) -> None:
+        """Go on after a step; reports: the last words of roles that have left before."""
+        self._granted = step
+        self.reports.update(reports)
+        self._gone += reports
+        for name in self.services.turns:
+            if name not in {spec.name for spec in self.setup.scenario.estimators}:
+                self._take_estimates(name, OPEN)
+
+    @property
+    def last_words(self) -> dict[str, Status]:
+        """Of roles that have left."""
+        return {role: self.reports[role] for role in self._gone if role in self.reports}
+
+    @property
+    def awaited_words(self) -> bool:
+        """Whether a role that has left has not reported yet."""
+        return any(role in self._present and role not in self.reports for role in self._gone)
+
+    def _advance_soon(self) -> None:
+        self.activity += 1
+        self.node.bus.call(self._advance)
+
+    def _comes_back(self, role: str) -> bool:
+        return self.recovery.policy(role) == "restart"
 
     def _fails(self, role: str) -> bool:
         return self.recovery.policy(role) == "fail"
@@ -397,6 +483,7 @@ class Conductor:
                 self._record(keys.delivered(link), model, link_role(link), f"{link}/delivered")
 
     def _record(self, key: str, model: type[Packet], source: str, topic: str) -> None:
+        self.recorded.append(topic)
         whole = self.setup.real or self.setup.tap >= self.setup.sizes.lanes
         taken = key if whole else self.node.keys.tap(key)
         self.node.on(taken, model, source, partial(self._write, topic), cut=not whole)
@@ -411,7 +498,10 @@ class Conductor:
         role = key.rsplit("/", 1)[1]
         if alive and self.services.here(role):
             self.activity += 1
-            self._advance()
+            if self.started:
+                self._advance()
+            else:
+                self._begin()
             return
         if not alive and not self._stopping and self._lost(role, f"{role} is gone"):
             self._present.discard(role)
@@ -428,14 +518,14 @@ class Conductor:
         self.activity += 1
         if role in self.recovery.down:
             self._is_back(role)
-        if not self.missing and not self.started:
+        self._begin()
+
+    def _begin(self) -> None:
+        """Once everybody is there."""
+        if not self.started and self.services.all_are_there() and not self.missing:
             self._begun = True
-            self.on_started()
-            if self.pacing is not None:
-                self.pacing.begin()
-                self.timeline.begin_real(self.node.bus.clock.monotonic_of(self.pacing.times.start_ns))
-            else:
-                self._advance()
+            self.on_progress()
+            self._go()
 
     def _status(self, role: str, status: Status, _: Arrays) -> None:
         if status.state == "alive":
@@ -460,6 +550,9 @@ class Conductor:
     def _collected(self, topic: str, packet: Packet, arrays: Arrays) -> None:
         self.activity += 1
         self._write(topic, packet, arrays)
+        if self.collector.completed != self._told:
+            self._told = self.collector.completed
+            self.on_progress()
         self._advance()
 
     def _advance(self) -> None:
@@ -471,12 +564,15 @@ class Conductor:
             return
         if self.pacing is not None:
             self.timeline.proceed_real(self._granted, self.collector.estimated)
+            if self.services.pending and not self.over:
+                self.services.proceed(self._granted, self.collector.estimated)
             return
         self._grant_more()
         while (
             self.timeline.pending and not self.over and self.timeline.proceed(self._granted, self.collector.estimated)
         ):
             self._grant_more()
+            self.on_progress()
 
     def _grant_more(self) -> None:
         steps, credit = self._steps, self._credit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -152,6 +153,17 @@ def check_role(scenario: Scenario, role: str, where: str = "") -> None:
 def _shown(settings: tuple[str, dict[str, Any]]) -> str:
     options = ", ".join(f"{key} = {value!r}" for key, value in settings[1].items())
     return f"{settings[0]!r}{f' ({options})' if options else ''}"
+
+
+def default_folder(scenario: Scenario) -> Path:
+    """runs/NAME-TIME, one that is not there yet."""
+    name = "".join(c if c.isalnum() or c in "._-" else "-" for c in scenario.name)
+    path = out = Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    number = 1
+    while out.exists():
+        number += 1
+        out = path.with_name(f"{path.name}-{number}")
+    return out
 
 
 def prepare_folder(out: Path) -> None:

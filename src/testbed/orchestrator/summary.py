@@ -291,12 +291,19 @@ class Happened(_Model):
 
 
 class Downtime(_Model):
-    """How long the clock stood still for a change of estimators; no step was left out."""
+    """What a change of estimators cost in time; no step was left out."""
 
     step: NonNegativeInt
     estimator: str
     steps: NonNegativeInt = Field(default=0, description="steps without an estimate of it")
-    ms: Number = Field(description="on the wall clock, from the last estimate before to the clock that goes on")
+    ms: Number = Field(description="how long the clock stood still, on the wall clock; never in real time")
+    late_ms: Number = Field(
+        default=None,
+        description="in real time: the largest time from t_k to publication of the first ten estimates from there on",
+    )
+    missed: NonNegativeInt | None = Field(
+        default=None, description="in real time: how many of those ten missed their deadline"
+    )
 
 
 class Recovered(_Model):

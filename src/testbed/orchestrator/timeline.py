@@ -9,7 +9,7 @@ goes one step at a time: a condition that begins to hold at step k takes effect 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -98,7 +98,11 @@ class Timeline:
         self._start_ns: int | None = None
         self._events: list[tuple[Event, Happened]] = []
         """Those that need nobody but the roles: they hold from their step on, whatever happens."""
-        self._others: list[Happened] = []
+        self.others: list[Happened] = []
+        """What was done to processes and with snapshots, and what was refused."""
+        self.decided: Callable[[Any, Origin, int], None] = lambda event, origin, step: None
+        """Called with what takes effect, and the step."""
+        self.refused: Callable[[Happened], None] = lambda entry: None
         self._due: list[_Due] = []
         self._waiting: dict[int, _Waiting] = {}
         self._watch = Watch([lane for lane, _ in setup.blocks], self._runs)
@@ -208,6 +212,25 @@ class Timeline:
             for message in self.told_to(part):
                 self._tell[part](message)
 
+    def name_origins(self, origins: Mapping[int, Origin], numbers: int) -> None:
+        """Of a run that goes on: who asked for events of the scenario, by their place; numbers: how many were given."""
+        for due in self._due:
+            due.origin = origins.get(due.origin.number, due.origin)
+        self._events = [
+            (
+                event,
+                entry
+                if (new := origins.get(-1 if entry.number is None else entry.number)) is None
+                else entry.model_copy(update=asdict(new)),
+            )
+            for event, entry in self._events
+        ]
+        self._ordered = max(0, numbers - len(self._setup.scenario.events))
+
+    def begin_after(self, step: int) -> None:
+        """What was to be done up to a step is done."""
+        self._due = [due for due in self._due if due.step > step]
+
     def give_up(self) -> None:
         """The run is over: what has not happened will not."""
         self._services.give_up()
@@ -223,7 +246,7 @@ class Timeline:
     def happened(self, until: int) -> list[Happened]:
         """What took effect up to a step, in order of time, and what was refused."""
         done = [entry for _, entry in self._events]
-        done += [*self._others, *self._services.happened]
+        done += [*self.others, *self._services.happened]
         return sorted((e for e in done if e.step <= until or not e.ok), key=lambda e: e.step)
 
     @property
@@ -267,10 +290,6 @@ class Timeline:
         events = self._setup.scenario.events
         try:
             made = _Ordered.model_validate({"events": (table if given else {**table, "at": granted + 1},)}).events[0]
-            if self._setup.real and isinstance(made, ESTIMATOR_EVENTS):
-                raise UsageError(
-                    "the run keeps real time, which does not wait for a new estimator; allowed: in virtual time"
-                )
             check_event(made, self._around, events)
         except ValidationError as error:
             raise UsageError(explain(error, _Ordered).removeprefix("events[0]").lstrip(".: ")) from None
@@ -297,6 +316,7 @@ class Timeline:
         elif isinstance(event, InputEvent | PlantEvent):
             part = CONTROLLER if isinstance(event, InputEvent) else PLANT
             self._send(part, step, event.model_dump(mode="json", exclude_none=True))
+        self.decided(event, origin, step)
         self._events.append((event, happened(event, origin, step, links)))
 
     def _link_tables(self, event: LinkEvent | CutEvent, step: int) -> dict[str, dict[str, Any]]:
@@ -352,7 +372,8 @@ class Timeline:
         except TestbedError as error:
             self._refuse(event, due.origin, due.step, str(error))
             return
-        self._others.append(happened(event, due.origin, due.step).model_copy(update=update))
+        self.decided(event, due.origin, due.step)
+        self.others.append(happened(event, due.origin, due.step).model_copy(update=update))
 
     def _role(self, role: str, step: int) -> str:
         """The role by its name in the scenario: for an estimator whoever serves it now. Raises UsageError."""
@@ -379,7 +400,8 @@ class Timeline:
 
     def _refuse(self, event: Event, origin: Origin, step: int, reason: str) -> None:
         entry = happened(event, origin, step).model_copy(update={"ok": False, "reason": reason})
-        self._others.append(entry)
+        self.others.append(entry)
+        self.refused(entry)
         self._say(f"step {step}: {entry.text}")
 
 

@@ -56,6 +56,14 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN_MAX else text[: SHOWN_MAX - 2] + " …"
 
 
+def plain(tables: dict[str, Any]) -> dict[str, Any]:
+    """Tables with the numbers and arrays of numpy in them as Python's own."""
+    return {
+        key: plain(value) if isinstance(value, dict) else value.tolist() if hasattr(value, "tolist") else value
+        for key, value in tables.items()
+    }
+
+
 def count(amount: int, noun: str) -> str:
     """An amount with its noun: "1 row", "2 rows"."""
     return f"{amount} {noun}" if amount == 1 else f"{amount} {noun}s"

@@ -26,7 +26,6 @@ from testbed.scenario.transport import Clock
 
 EXACT = (LinkEvent, CutEvent, InputEvent, PlantEvent, MarkEvent)
 """Those whose step is exact in real time, too: the roles know it, or nobody needs to."""
-IN_REAL_TIME = (*EXACT, ProcessEvent)
 
 
 @dataclass(frozen=True)
@@ -78,13 +77,8 @@ def check_event(event: Event, around: Surroundings, events: Sequence[Event], at:
 
     ``events``: all of the scenario, whose estimators it may name.
     """
-    if around.clock.mode == "real" and not isinstance(event, IN_REAL_TIME):
-        allowed = "set, partition, heal, input, plant, mark, kill, pause, restart"
-        raise problem(
-            f"got {event.action!r} with clock mode 'real', which does not wait for a new estimator; "
-            f"allowed there: {allowed}",
-            f"{at}.action",
-        )
+    if around.clock.mode == "real" and isinstance(event, SnapshotEvent):
+        raise problem("got 'snapshot' with clock mode 'real', which does not stand still for it", f"{at}.action")
     if event.timed:
         _check_step(event, around, at)
     else:

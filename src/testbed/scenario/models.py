@@ -1,13 +1,16 @@
 """The scenario as a whole."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, TypeVar
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
-from testbed.errors import did_you_mean
+from testbed.errors import UsageError, did_you_mean
 from testbed.scenario.actuator import Actuator
-from testbed.scenario.base import Count, Part, count, problem, shown
+from testbed.scenario.base import Count, Part, count, plain, problem, shown
 from testbed.scenario.changes import changed, in_turn
 from testbed.scenario.closed_loop import ClosedLoop, FeedbackInput, LqgInput, PidInput, PythonInput
 from testbed.scenario.cost import Cost
@@ -16,6 +19,7 @@ from testbed.scenario.estimator_events import ESTIMATOR_EVENTS, EstimatorEvent
 from testbed.scenario.estimators import EstimatorSpec
 from testbed.scenario.event_checks import Surroundings, check_events
 from testbed.scenario.events import Event, HealEvent, LinkEvent, PartitionEvent
+from testbed.scenario.files import resolve_files
 from testbed.scenario.inputs import ConstantInput, Input, TableInput, check_channels
 from testbed.scenario.link_timeline import changes_in
 from testbed.scenario.links import AckLink, Links, SteppedImpairments
@@ -26,6 +30,9 @@ from testbed.scenario.services import Planned, planned
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Transport
 from testbed.scenario.uncertainty import Uncertainty
+
+if TYPE_CHECKING:
+    from testbed.orchestrator.live import LiveRun
 
 E = TypeVar("E", bound=AnyEvent)
 
@@ -50,7 +57,10 @@ def _cost_of_input(data: dict[str, Any]) -> Cost | None:
 
 
 class Scenario(Part):
-    """Everything that determines a run: the same scenario and seed give the same results."""
+    """Everything that determines a run: the same scenario and seed give the same results.
+
+    In Python its tables are keywords, with values as in the file: ``Scenario(steps=50, system={"A": [[1.0]], …})``.
+    """
 
     name: str = Field(
         default="scenario",
@@ -84,6 +94,25 @@ class Scenario(Part):
     events: Annotated[tuple[Event, ...], Field(strict=False)] = Field(
         default=(), description="The timeline: what happens while the run goes."
     )
+
+    def __init__(self, /, **tables: Any) -> None:
+        """Relative paths are taken from the current folder. Raises UsageError, of one line."""
+        from testbed.scenario.explain import explain
+
+        try:
+            super().__init__(**resolve_files(plain(tables), Path()))
+        except ValidationError as error:
+            raise UsageError(explain(error)) from None
+
+    def start(self, out: str | PathLike[str] | None = None, *, in_process: bool = False) -> "LiveRun":
+        """Start a run of it that a script steers; results go into the folder ``out``, by default runs/NAME-TIME.
+
+        It waits at the beginning until the script lets it go: see ``testbed.orchestrator.live``, which is loaded here
+        by its name, as a scenario knows nothing of how it is run. ``in_process``: everything in this process, without
+        zenoh. Raises UsageError where the scenario cannot run, RunFailed where the roles do not start.
+        """
+        run: LiveRun = import_module("testbed.orchestrator.live").start(self, out, in_process=in_process)
+        return run
 
     @field_validator("uncertainty")
     @classmethod

@@ -77,6 +77,18 @@ class Keys:
         """Where a role gives its state now and then."""
         return f"{self.prefix}/state/{role}"
 
+    def told(self, role: str) -> str:
+        """Where the orchestrator tells an estimator's service, in real time, what to do after a step to come."""
+        return f"{self.handover(role)}/told"
+
+    def said(self, role: str) -> str:
+        """What the service says to that."""
+        return f"{self.handover(role)}/said"
+
+    def handed(self, role: str) -> str:
+        """Where another service hands its state to this one."""
+        return f"{self.handover(role)}/state"
+
     def status(self, role: str) -> str:
         return f"{self.prefix}/status/{role}"
 
