@@ -25,8 +25,8 @@ def event(action: str, **keys: str) -> str:
 
 EVENTS = (
     event("partition", at="20", links='["observation"]')
-    + event("heal", when='"loss_rate(observation, last 5 steps) >= 1"')
-    + event("plant", when='"trace_P(aoe) > 0 for 30 steps"', R="[[3.0]]", over="8")
+    + event("heal", when='"loss_rate(observation, last 5 steps) >= 1 and step >= 24"')
+    + event("plant", when='"trace_P(aoe) > 0 for 30 steps"', R="[[3.0, 0.0], [0.0, 3.0]]", over="8")
     + event("swap", when='"step == 50"', estimator='"aoe"', to='{ kind = "imm" }')
     + event("snapshot", at="60", estimator='"aoe"')
     + event("mark", when='"error(aoe) > 0 and step > 70"', name='"end"')
@@ -64,7 +64,10 @@ def test_events_by_command(tmp_path: Path, capfd: pytest.CaptureFixture[str]) ->
     assert run_command(["ctl", str(out), "partition", "observation"]) == 0
     assert run_command(["ctl", str(out), "heal"]) == 0
     assert run_command(["ctl", str(out), "hold"]) == 0
-    assert run_command(["ctl", str(out), "event", 'action = "plant", R = [[2.0]]', "--when", "step > 5"]) == 0
+    assert (
+        run_command(["ctl", str(out), "event", 'action = "plant", R = [[2.0, 0.0], [0.0, 2.0]]', "--when", "step > 5"])
+        == 0
+    )
     assert run_command(["ctl", str(out), "acks", "perfect", "--at", "1"]) == 2
     assert run_command(["ctl", str(out), "release"]) == 0
     assert run_command(["ctl", str(out), "event", "nonsense"]) == 2
