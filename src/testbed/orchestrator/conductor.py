@@ -95,8 +95,8 @@ class Conductor:
         self.activity = 0
         """Grows with every message that was of use."""
         self.on_started: Callable[[], None] = lambda: None
-        self.on_joined: Callable[[str], None] = lambda role: None
-        """Called with a role that has come while the run goes."""
+        self.on_present: Callable[[str], None] = lambda role: None
+        """Called with each role that comes while the run goes."""
         self.on_progress: Callable[[], None] = lambda: None
         """Called when all roles are there, when steps are complete, and when events are decided."""
         self.say: Callable[[str], None] = lambda line: None
@@ -389,6 +389,7 @@ class Conductor:
     def _leaves(self, role: str) -> None:
         self._roles.remove(role)
         self._gone.append(role)
+        self.recovery.down.pop(role, None)
 
     def _lost(self, role: str, reason: str) -> bool:
         """Whether a role that is lost is of no consequence but for the change that it was to make."""
@@ -498,10 +499,11 @@ class Conductor:
 
     def _presence(self, key: str, alive: bool) -> None:
         role = key.rsplit("/", 1)[1]
+        if alive and self.started:
+            self.on_present(role)
         if alive and self.services.here(role):
             self.activity += 1
             if self.started:
-                self.on_joined(role)
                 self._advance()
             else:
                 self._begin()
