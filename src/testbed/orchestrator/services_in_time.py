@@ -127,8 +127,8 @@ class ServicesInTime(Services):
                 if role == talk.new or not self._is_handed(talk):
                     self._put_off(talk)
             return False
-        talk = self._talks.get(id(entry))
-        return super().lost(role, reason if talk is None else talk.given_up or reason)
+        own = self._talks.get(id(entry))
+        return super().lost(role, reason if own is None else own.given_up or reason)
 
     def give_up(self) -> None:
         """The run is over: what has not happened will not."""
