@@ -2,56 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orchestrator.runs import scenario
-from testbed.orchestrator.collect import Collector
-from testbed.scenario import Scenario
-from testbed.wire.setup import Setup
-
-STEPS, LANES = 4, 5
-Part = tuple[str, int, int]
-
-
-def given_scenario(**changes: Any) -> Scenario:
-    estimators = [{"name": "aoe"}, {"name": "oe", "acks": "none", "until": 2}]
-    own = {"steps": STEPS, "lanes": LANES, "estimators": estimators, "transport": {"lanes_per_packet": 2}}
-    return scenario(**{**own, **changes})
-
-
-class Bench:
-    """A collector, and parts with random contents to give it."""
-
-    def __init__(self, made: Scenario, seed: int = 1) -> None:
-        self.setup = Setup("run0testrun1", made)
-        self.collector = Collector(self.setup)
-        rng = np.random.default_rng(seed)
-        self.x = rng.normal(size=(STEPS + 1, LANES, 2))
-        self.nu = rng.integers(0, 2, size=(STEPS + 1, LANES)).astype(np.uint8)
-        self.x_hat = {name: rng.normal(size=(STEPS + 1, LANES, 2)) for name in ("aoe", "oe")}
-        root = rng.normal(size=(STEPS + 1, LANES, 2, 2))
-        self.P = root @ root.swapaxes(2, 3) + np.eye(2)
-        self.traces = rng.random(size=(2, STEPS + 1, LANES))
-
-    def parts(self) -> list[Part]:
-        """All parts of a run: (what, step, lane)."""
-        kinds = [("truth", STEPS), ("aoe", STEPS), ("oe", 2), ("bounds", STEPS)]
-        return [(what, k, lane) for what, last in kinds for k in range(1, last + 1) for lane, _ in self.setup.blocks]
-
-    def give(self, part: Part) -> None:
-        what, k, lane = part
-        rows = slice(lane, lane + dict(self.setup.blocks)[lane])
-        if what == "truth":
-            self.collector.truth(k, lane, {"x": self.x[k, rows], "nu": self.nu[k, rows]})
-        elif what == "bounds":
-            lower, upper = self.traces[:, k, rows]
-            self.collector.bound(k, lane, {"trace_lower": lower, "trace_upper": upper})
-        else:
-            self.collector.estimate(what, k, lane, {"x_hat": self.x_hat[what][k, rows], "P": self.P[k, rows]})
+from orchestrator.parts import STEPS, Bench, Part, given_scenario
 
 
 def complete_steps(given: set[Part], all_parts: list[Part]) -> int:

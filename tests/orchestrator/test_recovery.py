@@ -115,7 +115,7 @@ def test_a_run_goes_on_without_an_estimator_that_may_be_missed(tmp_path: Path) -
 
 def test_a_role_is_started_anew_only_so_often(tmp_path: Path) -> None:
     given = scenario(recovery={"every": 4, "restarts": 2})
-    lost = run(given, tmp_path, None, killing((100, "plant"), (250, "plant"), (400, "plant")))
+    lost = run(given, tmp_path, None, killing(*((at, "plant") for at in range(100, 400, 50))))
     assert lost.status == "failed"
     assert lost.reason == "plant is gone; it was started anew 2 times before"
 

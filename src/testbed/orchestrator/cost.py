@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from testbed.numerics.lanes import (
@@ -15,7 +17,7 @@ from testbed.numerics.lanes import (
     vector_of,
 )
 from testbed.numerics.moments import LaneMoments, Result
-from testbed.orchestrator.statistics import Series
+from testbed.orchestrator.statistics import Arrays, Series
 from testbed.scenario import Cost, System
 
 FIGURES = ("step", "state", "input")
@@ -63,6 +65,17 @@ class CostBook:
         self.series.close(step)
         for lane, cost in self._open.pop(step).items():
             self._sums[lane] = self._sums[lane] + cost if lane in self._sums else cost
+
+    def state(self, step: int) -> Arrays:
+        """What outlives the last complete step beside the figures: sums (lanes,), once there are any."""
+        sums = [np.atleast_1d(self._sums[lane]) for lane in sorted(self._sums)]
+        return {**self.series.state(step), **({"sums": np.concatenate(sums)} if sums else {})}
+
+    def put_state(self, step: int, arrays: Arrays, blocks: Sequence[tuple[int, int]]) -> None:
+        """Have what ``state`` gave; blocks: (first lane, number of lanes)."""
+        self.series.put_state(step, arrays)
+        for lane, lanes in blocks if "sums" in arrays else ():
+            self._sums[lane] = float(arrays["sums"][lane]) if lanes == 1 else arrays["sums"][lane : lane + lanes].copy()
 
     def total(self) -> Result:
         """Number of lanes, mean of their sums over the closed steps, and its standard error.

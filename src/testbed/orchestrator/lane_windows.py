@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable
 
 import numpy as np
@@ -42,6 +42,21 @@ class LaneWindows:
     def add(self, step: int, lane: int, values: Floats) -> None:
         """Values of shape (F or more, M) of the lanes lane … lane + M − 1; those of a lane come in order of steps."""
         self._sums[bisect_left(self.ends, step), :, lane : lane + values.shape[1]] += values[: self._figures]
+
+    def closed(self, after: int, to: int) -> Floats:
+        """(W, F, lanes): sums of the windows whose last step is one of after + 1 … to."""
+        sums: Floats = self._sums[bisect_right(self.ends, after) : bisect_right(self.ends, to)]
+        return sums
+
+    def put_closed(self, after: int, to: int, sums: Floats) -> None:
+        """Have the sums that ``closed`` gave, which may go further."""
+        begin, end = bisect_right(self.ends, after), bisect_right(self.ends, to)
+        self._sums[begin:end] = sums[: end - begin]
+
+    def open_at(self, step: int) -> Floats:
+        """(F, lanes): sums of the window that the step after ``step`` belongs to; may be written to."""
+        sums: Floats = self._sums[min(bisect_right(self.ends, step), len(self.ends) - 1)]
+        return sums
 
     def begin_at(self, first: int) -> None:
         """There are no values before step ``first``: the windows that begin before it have no mean."""

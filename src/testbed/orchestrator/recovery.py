@@ -94,7 +94,7 @@ class Recovery:
         step = self._collector.completed
         if policy == "continue" and started:
             name = next(n for n, turns in self._services.turns.items() if turns[-1].role == role)
-            last = self._collector.abandon(name)  # type: ignore[attr-defined]
+            last = self._collector.abandon(name)
             self.happened.append(Recovered(role=role, how=how, step=step, policy="continue", begin=last))
             self.missed(role, last)
             return True

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from testbed.numerics.lanes import (
     Cholesky,
@@ -23,6 +25,8 @@ from testbed.numerics.lanes import (
 from testbed.numerics.moments import LaneMoments, Result
 from testbed.numerics.symbols import Shape
 from testbed.orchestrator.lane_windows import LaneWindows
+
+Arrays = dict[str, NDArray[Any]]
 
 LANE_FIGURES = ("trace_P", "squared_error", "nees")
 """Those that are kept of each lane."""
@@ -68,6 +72,7 @@ class Series:
         self._kept = names[:kept]
         self._windows = LaneWindows(ends, kept, lanes) if kept else None
         self._open: dict[int, Figures | LaneMoments] = {}
+        self._of_lanes: dict[int, list[tuple[int, Floats]]] = {}
         self._closed: list[Figures | list[Result] | None] = []
 
     def add(self, step: int, lane: int, figures: Figures) -> None:
@@ -83,7 +88,7 @@ class Series:
         values = np.array([figures.get(name, absent) for name in self.names]).reshape(len(self.names), -1)
         moments.add(lane, values)
         if self._windows is not None:
-            self._windows.add(step, lane, values)
+            self._of_lanes.setdefault(step, []).append((lane, values))
 
     def begin_at(self, first: int, completed: int) -> None:
         """There are no figures before step ``first``; so many steps are complete already."""
@@ -94,7 +99,68 @@ class Series:
     def close(self, step: int) -> None:
         """The next step is complete: keep its figures and forget the sums."""
         figures = self._open.pop(step, None)
-        self._closed.append(figures.results() if isinstance(figures, LaneMoments) else figures)
+        if not isinstance(figures, LaneMoments):
+            self._closed.append(figures)
+            return
+        self._closed.append(figures.results())
+        if self._windows is not None:
+            for lane, values in self._of_lanes.pop(step):
+                self._windows.add(step, lane, values)
+
+    def drop(self, step: int) -> None:
+        """Forget what has come of a step that is not closed."""
+        self._open.pop(step, None)
+        self._of_lanes.pop(step, None)
+
+    def figures(self, after: int, to: int) -> Arrays:
+        """What stays of the closed steps after + 1 … to, and of the windows that end there."""
+        rows = self._closed[after:to]
+        there = np.array([row is not None for row in rows], dtype=np.uint8)
+        arrays = {"there": there, "rows": np.array([self._numbers(row) for row in rows])}
+        if self._by_window is not None:
+            arrays["windows"] = self._by_window.closed(after, to)
+        return arrays
+
+    def put_figures(self, after: int, to: int, arrays: Arrays) -> None:
+        """Have what ``figures`` gave, which may go further, up to step ``to``, and nothing after it."""
+        closed, count = self._closed, to - after
+        del closed[after:]
+        closed += [None] * (after - len(closed))
+        for there, row in zip(arrays["there"][:count].tolist(), arrays["rows"][:count].tolist(), strict=True):
+            closed.append(self._closed_row(row) if there else None)
+        if self._by_window is not None:
+            self._by_window.put_closed(after, to, arrays["windows"])
+
+    def state(self, step: int) -> Arrays:
+        """What outlives step ``step``, the last that is closed, beside the figures."""
+        return {} if self._by_window is None else {"open": self._by_window.open_at(step)}
+
+    def put_state(self, step: int, arrays: Arrays) -> None:
+        """Have what ``state`` gave, after the figures up to that step."""
+        self._closed += [None] * (step - len(self._closed))
+        if self._by_window is not None:
+            self._by_window.open_at(step)[:] = arrays["open"]
+
+    @property
+    def _by_window(self) -> LaneWindows | None:
+        """Sums that are made on the way; of one lane they are made at the end."""
+        return None if self._lanes == 1 else self._windows
+
+    def _numbers(self, row: Figures | list[Result] | None) -> list[float] | list[list[float]]:
+        """A closed step in numbers; NaN for what there is not."""
+        if self._lanes == 1:
+            assert not isinstance(row, list)
+            return [(row or {}).get(name, math.nan) for name in self.names]
+        if row is None:
+            return [[math.nan] * 3] * len(self.names)
+        assert isinstance(row, list)
+        return [[count, _or_nan(mean), _or_nan(stderr)] for count, mean, stderr in row]
+
+    def _closed_row(self, row: list[Any]) -> Figures | list[Result]:
+        """From the numbers of a closed step."""
+        if self._lanes == 1:
+            return dict(zip(self.names, row, strict=True))
+        return [(int(n), mean if n else None, stderr if n > 1 else None) for n, mean, stderr in row]
 
     @property
     def mean(self) -> dict[str, list[float | None]]:
@@ -138,6 +204,10 @@ class Series:
             return closed
         values = [closed.get(name, math.nan) for name in self.names]
         return [(1, value, None) if math.isfinite(value) else _ABSENT for value in values]
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 _ABSENT: Result = (0, None, None)
