@@ -8,7 +8,7 @@ from functools import partial
 
 from faults.disturbances import Disturbance, Garbage, Kill, Repeat, Stall
 from testbed.wire.bus import Answer, BusError, Publish
-from testbed.wire.memory_bus import MemoryBus, MemoryNetwork
+from testbed.wire.memory_bus import MemoryBus, MemoryNetwork, matches
 
 ORCHESTRATOR = "orchestrator"
 
@@ -108,7 +108,7 @@ class DisturbedNetwork(MemoryNetwork):
     def _route(self, key: str) -> list[tuple[MemoryBus, Callable[[str, bytes], None]]]:
         route = self._routes.get(key)
         if route is None:
-            route = [(bus, handler) for pattern, bus, handler in self._subscribers if _matches(pattern, key)]
+            route = [(bus, handler) for pattern, bus, handler in self._subscribers if matches(pattern, key)]
             self._routes[key] = route
         return route
 
@@ -188,8 +188,3 @@ def _deliver(handler: Callable[[str, bytes], None], message: _Message) -> None:
         message.taken += 1
         handler(message.key, message.payload)
 
-
-def _matches(pattern: str, key: str) -> bool:
-    from testbed.wire.memory_bus import matches
-
-    return matches(pattern, key)
