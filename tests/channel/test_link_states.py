@@ -56,7 +56,7 @@ transports = st.sampled_from(
 @st.composite
 def changes(draw: st.DrawFn, timed: bool) -> list[tuple[int, dict[str, Any]]]:
     """At steps in order, some of them at one step."""
-    keys = {"loss": losses, **(stages if timed else {})}
+    keys = {"loss": losses, "up": st.booleans(), **(stages if timed else {})}
     at = sorted(draw(st.lists(st.integers(1, STEPS - 1), max_size=4)))
     names = [draw(st.sampled_from(sorted(keys))) for _ in at]
     return [(step, {name: draw(keys[name])}) for step, name in zip(at, names, strict=True)]
@@ -145,9 +145,32 @@ def test_a_link_goes_on_with_the_same_fates_contents_and_counts(
 TABLES: dict[str, Any] = {
     "steps": STEPS,
     "lanes": 2,
-    "system": {"A": [[1.0]], "B": [[1.0]], "C": [[1.0]], "Q": [[1.0]], "R": [[1.0]]},
+    "system": {"A": [[1.0]], "B": [[1.0]], "C": [[1.0], [2.0]], "Q": [[1.0]], "R": [[1.0, 0.0], [0.0, 1.0]]},
     "estimators": [{"name": "aoe", "acks": "none"}],
 }
+LOSS = {"kind": "bernoulli", "loss": 0.2}
+MESSY: dict[str, Any] = {"delay": {"kind": "uniform", "low": "1 ms", "high": "45 ms"}, "duplicate": {"chance": 0.3}}
+WAYS: dict[str, dict[str, Any]] = {
+    "udp": {"transport": {"kind": "udp"}, "delay": {"kind": "constant", "by": "25 ms"}},
+    "fragments": {"transport": {"kind": "udp", "mtu": 100, "late": "deliver"}, **MESSY},
+    "tcp": {"transport": {"kind": "tcp"}, "delay": {"kind": "constant", "by": "25 ms"}},
+    "segments": {"transport": {"kind": "tcp", "mss": 60, "buffer_bytes": 400}, **MESSY},
+    "waiting": {
+        "transport": {"kind": "tcp", "buffer_bytes": 1448, "mss": 200},
+        "delay": {"kind": "constant", "by": "70 ms"},
+    },
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_contents_that_a_transport_has_on_its_way_arrive(way: str) -> None:
+    tables = {**TABLES, "clock": {"period": "10 ms"}, "links": {"observation": {"loss": LOSS, **WAYS[way]}}}
+    setup = Setup(RUN, parse_scenario(tables))
+    sent = packets(setup, "observation", False)
+    life = live(Life(builder("observation")), setup, "link.observation", sent)
+    assert life.counters["late"] > 5
+    for begin in range(1, STEPS + 1):
+        check_resumed(life, setup, "link.observation", sent, begin)
 
 
 @pytest.mark.parametrize(
@@ -164,7 +187,7 @@ def test_a_state_of_another_link_is_refused(loss: dict[str, Any], wrong: dict[st
     life = live(Life(builder("control")), setup, "link.control", packets(setup, "control", False)[:0])
     link: LinkService = life.service
     right = {"transitions": np.zeros((2, 2), dtype=np.int64)}
-    numbers = {"sent": 6, "delivered": 1, "bursts": 1}
+    numbers = {"sent": 6, "delivered": 1, "bursts": 1, "cut": 0}
     link.resume(0, 3, pack(right, step=3, changes=0, **numbers))
     assert unpack(link.state(0)).number("sent") == 6
     for arrays, step, made in ((right, 4, 0), (right, 3, 1), ({**right, **wrong}, 3, 0)):

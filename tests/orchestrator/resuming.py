@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from testbed.orchestrator import services
+from testbed.estimator import service
 from testbed.orchestrator.run import Run
 from testbed.scenario import Scenario
 from testbed.wire.bundle import unbundle
@@ -125,7 +125,7 @@ def whole_run(scenario: Scenario, out: Path, schedule: int | None = None) -> Who
         pass
 
     Network.log = log
-    joined, ask = services.builder, MemoryBus.ask
+    joined, ask = service.builder, MemoryBus.ask
 
     def asked(bus: MemoryBus, key: str, question: bytes = b"") -> bytes:
         log.append((key, question))

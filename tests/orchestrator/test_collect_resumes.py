@@ -215,10 +215,10 @@ def test_what_does_not_belong_to_the_run_is_refused() -> None:
     made.collector.on_completed = lambda step: kept.append((made.collector.state(), made.collector.figures(1, step)))
     for part in made.parts():
         made.give(part)
-    (early, _), (state, part) = kept[1], kept[4]
+    (early, _), (state, later) = kept[1], kept[4]
     whole = made.collector.figures(0, 5)
     cases: list[tuple[str, bytes, list[bytes], str]] = [
-        ("blocks", state, [part], "no figures of the steps 1 … 1"),
+        ("blocks", state, [later], "no figures of the steps 1 … 1"),
         ("blocks", early, [whole], "not that after step 5"),
         ("blocks", state, [], "figures of 0 steps, expected 5"),
         ("blocks", state, [whole[:-1]], "digest"),

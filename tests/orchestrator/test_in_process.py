@@ -400,8 +400,8 @@ def test_everybody_hears_what_is_theirs(tmp_path: Path) -> None:
     by_name = {name: heard[i] - {"command"} for i, name in enumerate(names)}
     assert len(network.buses) == len(names)
     assert [name for name in names if "truth" in by_name[name]] == ["orchestrator"]
-    assert by_name["controller"] == {"clock"}
-    assert by_name["plant"] == {"control/delivered"}
+    assert by_name["controller"] == {"clock", "controller/change"}
+    assert by_name["plant"] == {"control/delivered", "plant/change"}
     assert by_name["bounds"] == {"observation/delivered"}
     for link in ("control", "observation", "ack"):
         assert by_name[link] == {f"{link}/sent", f"{link}/change"}

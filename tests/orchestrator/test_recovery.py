@@ -190,3 +190,41 @@ def test_nobody_but_the_roles_is_told_where_to_begin(tmp_path: Path) -> None:
     run(scenario(recovery={"every": 2}), tmp_path, None, Asking)
     assert len(set(answers)) == 1
     assert b'"step":0,"late":false' in answers[0]
+
+
+SWAPS = [
+    {"at": 5, "action": "swap", "estimator": "aoe", "to": {"kind": "ff"}, "handover": "moments"},
+    {"at": 6, "action": "shadow", "estimator": "ff", "name": "beside", "to": {"kind": "gpb1"}},
+    {"at": 9, "action": "swap", "estimator": "ff", "to": "beside"},
+    {"at": 11, "action": "add", "estimator": "late", "to": {"kind": "imm", "acks": "none"}},
+    {"at": 14, "action": "swap", "estimator": "aoe", "to": {"kind": "ff"}, "handover": "full"},
+    {"at": 16, "action": "remove", "estimator": "late"},
+]
+
+
+def killing_after(role: str, *published: int) -> type[MemoryNetwork]:
+    """A network on which a role is lost each time that it has published so many messages of the loop, all told."""
+
+    class Killing(MemoryNetwork):
+        count = 0
+
+        def _publish(self, key: str, payload: bytes) -> None:
+            super()._publish(key, payload)
+            if f'"source":"{role}","seq"'.encode() in payload:
+                self.count += 1
+                if self.count in published:
+                    for bus in [bus for bus, token in self._tokens if token.endswith(f"/presence/{role}")]:
+                        bus.call(bus.close)
+
+    return Killing
+
+
+@pytest.mark.parametrize("every", [2, 7, 50])
+@pytest.mark.parametrize("role", ["estimator.aoe.2", "estimator.beside", "estimator.late", "estimator.aoe.3"])
+def test_services_that_joined_on_the_way_are_recovered_too(role: str, every: int, tmp_path: Path) -> None:
+    given = scenario(recovery={"every": every, "restarts": 100}, estimators=FOLLOWED, events=SWAPS)
+    plain = run(given, tmp_path / "plain")
+    lost = run(given, tmp_path / "lost", every, killing_after(role, 1, 4, 5, 9))
+    assert all(event.ok for event in plain.events)
+    assert {entry.role for entry in lost.recovered} == {role}
+    assert without(lost) == without(plain)

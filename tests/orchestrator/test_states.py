@@ -47,6 +47,12 @@ CASES: dict[str, dict[str, Any]] = {
     "hold": {"actuator": {"on_loss": "hold"}, "cost": {"Qx": [[1.0, 0.0], [0.0, 1.0]]}},
     "correlated": {"links": {"control": {"loss": MARKOV}}},
     "changed": {"events": CHANGED},
+    "drift": {
+        "events": [
+            {"at": 3, "action": "plant", "A": [[0.9, 0.1], [0.0, 0.5]], "R": [[0.8]], "over": 8},
+            {"at": 10, "action": "input", "input": {"kind": "constant", "value": [2.0]}},
+        ]
+    },
 }
 
 
@@ -55,7 +61,7 @@ def test_every_service_goes_on_to_the_same_bits(case: str, tmp_path: Path) -> No
     changes = CASES[case]
     specs = able(**changes)
     assert len(specs) >= (2 if case == "hold" else 8)
-    if "late" in case:
+    if "late" in case or case == "slots":
         specs = [spec for spec in specs if spec["name"] in ("aoe", "gpb", "kfio", "oe", "pf")]
         specs += [{"name": "acked", "kind": "aoe"}, {"name": "short", "kind": "gpb", "order": 1, "buffer": 2}]
     run = whole_run(scenario(**GIVEN, **changes, estimators=specs), tmp_path, 3 if case == "schedule" else None)

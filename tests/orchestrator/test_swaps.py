@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from orchestrator.commanding import commanded
 from orchestrator.runs import SYSTEM, figures, recorded, run, scenario
 from testbed.errors import UsageError
 from testbed.estimator import service
@@ -367,29 +368,6 @@ def test_what_builds_on_a_change_that_was_refused_is_refused(tmp_path: Path, mon
     assert (summary.status, list(summary.estimators)) == ("complete", ["aoe"])
 
 
-class Commanding(Conductor):
-    """A conductor of which somebody asks something when so many steps are complete."""
-
-    asked: dict[int, dict[str, Any]]
-    answers: list[dict[str, Any]]
-
-    def _collected(self, *arguments: Any) -> None:
-        super()._collected(*arguments)
-        import json
-
-        question = self.asked.pop(self.collector.completed, None)
-        if question is not None:
-            self.answers.append(json.loads(self._asked(json.dumps(question).encode())))
-
-
-def commanded(folder: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[int, dict[str, Any]], **changes: Any) -> Any:
-    Commanding.asked, Commanding.answers = dict(asked), []
-    monkeypatch.setattr("testbed.orchestrator.run.Conductor", Commanding)
-    specs = [{"name": "aoe", "acks": "none"}, {"name": "ff", "acks": "none"}]
-    summary = run(scenario(estimators=specs, clock={"window": 2}, **changes), folder)
-    return summary, Commanding.answers
-
-
 def test_by_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plain, _ = commanded(tmp_path / "plain", monkeypatch, {})
     event = {"action": "swap", "estimator": "aoe", "to": {"kind": "aoe"}, "handover": "full"}
@@ -428,9 +406,13 @@ def test_a_run_is_stopped_by_command(tmp_path: Path, monkeypatch: pytest.MonkeyP
     [
         ({"action": "swap", "estimator": "aeo", "to": {"kind": "ff"}}, "got 'aeo'; allowed at step"),
         ({"action": "swap", "estimator": "aoe", "to": {"kind": "fff"}}, "unknown estimator 'fff'; allowed: aoe"),
-        ({"action": "swop", "estimator": "aoe"}, "action: got 'swop'; allowed: swap, add, shadow, remove; did you"),
+        ({"action": "swop", "estimator": "aoe"}, "action: got 'swop'; allowed: set, swap, add, shadow, remove, acks,"),
         ({"action": "swap", "estimator": "aoe", "to": {"kind": "ff"}, "handover": "full"}, "which do not share the"),
-        ({"action": "set", "link": "control", "set": {}}, "action: got 'set'; allowed: swap, add, shadow, remove"),
+        ({"action": "set", "link": "control", "set": {}}, "set: got a table; allowed: a table with keys of the link"),
+        ({"action": "mark", "name": "x", "at": 2}, "at: got 2; allowed: "),
+        ({"action": "heal"}, "got all, and none is cut then; allowed: none"),
+        ({"action": "kill", "role": "plnt"}, "role: got 'plnt'; allowed: controller, plant, link.control, "),
+        ({"action": "mark", "name": "x", "when": "loss_rate(control) > 0"}, "when: got loss_rate(control); allowed: "),
         ({"action": "add", "estimator": "aoe", "to": {"kind": "ff"}}, "got 'aoe' a second time; allowed: a name of"),
     ],
 )
@@ -621,10 +603,3 @@ def test_the_statement_on_an_lqg_controller_knows_of_swaps() -> None:
         found = statement(scenario(input=loop, events=events))
         assert found is not None
         assert found.startswith(text)
-
-
-def test_real_time_does_not_wait_for_an_estimator() -> None:
-    events = [{"at": 3, "action": "swap", "estimator": "aoe", "to": {"kind": "kfio"}, "handover": "cold"}]
-    with pytest.raises(UsageError) as refusal:
-        scenario(clock={"mode": "real"}, events=events)
-    assert str(refusal.value).startswith("scenario: events[0].action: got 'swap' with clock mode 'real'")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from testbed.errors import UsageError
@@ -277,6 +277,7 @@ WORDS = [
 
 @settings(deadline=None)
 @given(st.one_of(st.text(max_size=40), st.lists(st.sampled_from(WORDS), max_size=12).map(" ".join)))
+@example("\x1f")
 def test_any_text_is_a_condition_or_refused_in_one_line(text: str) -> None:
     refused = refusal(text)
     assert refused is None or re.fullmatch("got .*; allowed: .*", refused)

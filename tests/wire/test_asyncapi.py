@@ -45,7 +45,7 @@ def test_addresses_are_the_keys_of_a_run() -> None:
     keys = Keys("{run}")
     addresses = {channel["address"] for channel in DOCUMENT["channels"].values()}
     links = [key for link in ("control", "observation", "ack") for key in (keys.sent(link), keys.delivered(link))]  # type: ignore[arg-type]
-    links.append(keys.change("{link}"))  # type: ignore[arg-type]
+    links.append(keys.change("{part}"))
     others = [keys.clock, keys.command, keys.truth, keys.bounds, keys.estimate("{name}"), keys.status("{role}")]
     assert addresses == {*links, *others, "testbed/{run}/tap/{link}/{end}"}
     assert keys.tap(keys.sent("control")) == "testbed/{run}/tap/control/sent"

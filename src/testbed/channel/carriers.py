@@ -21,5 +21,5 @@ def _carrier_of(link: SteppedImpairments, seed: int, component: str, lane: int) 
         return Datagrams(forward)
     if isinstance(link.transport, UdpTransport):
         return UdpCarrier(forward, link.transport)
-    backward = Pipeline(link.back or link, seed, f"{component}.back", lane)
+    backward = Pipeline(link.backwards, seed, f"{component}.back", lane)
     return TcpCarrier(forward, backward, link.transport)

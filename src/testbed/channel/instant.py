@@ -19,6 +19,8 @@ class InstantBlock:
     def __init__(self, process: FateProcess, lanes: int) -> None:
         self._process, self._lanes = process, lanes
         self.counts = LossCounts()
+        self.cut = 0
+        """Lane-packets that would have come through, and the link was cut."""
 
     @property
     def packets(self) -> int:
@@ -30,8 +32,12 @@ class InstantBlock:
         goes_on(process, self._process)
         self._process = process
 
-    def arrives(self, number: int) -> Mask:
+    def arrives(self, number: int, *, up: bool = True) -> Mask:
+        """Where packet ``number`` arrives; up: whether the link is, without which nothing does."""
         arrived = self._process.next(number)
+        if not up:
+            self.cut += int(np.count_nonzero(arrived))
+            arrived = False if isinstance(arrived, bool) else np.zeros_like(arrived)
         self.counts.count(arrived)
         return arrived
 
@@ -45,7 +51,7 @@ class InstantBlock:
         if counts.last is not None:
             arrays["last"] = np.atleast_1d(np.asarray(counts.last, dtype=np.uint8))
         arrays["transitions"] = np.array(counts.transitions, dtype=np.int64)
-        return arrays, {"sent": counts.sent, "delivered": counts.delivered, "bursts": counts.bursts}
+        return arrays, {"sent": counts.sent, "delivered": counts.delivered, "bursts": counts.bursts, "cut": self.cut}
 
     def resume(self, given: Unpacked) -> None:
         """Go on from the state of a block with the same process. Raises UsageError where it is none."""
@@ -54,4 +60,5 @@ class InstantBlock:
         last = mask_of(given.array("last", np.uint8, self._lanes)) if "last" in given else None
         transitions = given.array("transitions", np.int64, 2, 2).tolist()
         sent, delivered, bursts = (given.number(name) for name in ("sent", "delivered", "bursts"))
+        self.cut = given.number("cut")
         self.counts = LossCounts(sent, delivered, bursts, transitions, last)

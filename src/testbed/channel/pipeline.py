@@ -29,7 +29,7 @@ class Copy:
 class Pipeline:
     """The stages in order: loss → rate and queue → delay → reordering → duplication → corruption.
 
-    cause: why the last packet was dropped, "loss" or "queue"; None if it was not.
+    cause: why the last packet was dropped, "loss", "cut" or "queue"; None if it was not.
     """
 
     def __init__(self, settings: Impairments, seed: int, component: str, lane: int = 0) -> None:
@@ -54,7 +54,7 @@ class Pipeline:
 
     def _set(self, settings: Impairments) -> None:
         self.settings = settings
-        self._lossless = settings.loss.kind == "none"
+        self._lossless, self._up = settings.loss.kind == "none", settings.up
         if settings.rate is None:
             self._bottleneck = None
         elif self._bottleneck is None:
@@ -97,6 +97,10 @@ class Pipeline:
             books.drop("loss")
             return ()
         at_ns = now_ns
+        if not self._up:
+            self.cause = "cut"
+            books.drop("cut")
+            return ()
         if self._bottleneck is not None:
             left_ns = self._bottleneck.leave(size, now_ns)
             if left_ns is None:

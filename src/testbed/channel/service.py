@@ -97,7 +97,7 @@ class LinkService:
 
     Its state, on a link that takes no time: the state of the loss process and the counts. On one that does: the
     contents under way, and the rest is worked out again from packet 0 on, since fates do not depend on contents; that
-    takes as long as the link took with them, about @@ µs a packet and lane without a transport, @@ µs with tcp.
+    takes as long as the link took with them, about 10 µs a packet and lane without a transport, 40 µs with tcp.
     """
 
     def __init__(self, node: Node, setup: Setup, *, link: LinkName) -> None:
@@ -135,7 +135,9 @@ class LinkService:
         total: Counter[str] = Counter()
         for block in self._instant.values():
             total.update(block.counts.as_counters())
-        return dict(total)
+        cut = sum(block.cut for block in self._instant.values())
+        causes = {"dropped_cut": cut, "dropped_loss": total["dropped"] - cut} if cut else {}
+        return {**total, **causes}
 
     @property
     def gives_state(self) -> bool:
@@ -188,7 +190,7 @@ class LinkService:
         if self._changes:
             self._change(lane, packet.lanes, packet.step)
         number = packet.step - self._first_step
-        arrived = self._instant[lane].arrives(number)
+        arrived = self._instant[lane].arrives(number, up=self._now[lane][1].up)
         self._deliver(packet.step, lane, packet.lanes, self._content_of(arrays, arrived))
         self._node.done(number + 1, lane)
 

@@ -8,9 +8,11 @@ from typing import Annotated, Any
 
 import typer
 
-from testbed.errors import RunFailed, UsageError
+from testbed.cli import ctl_events
+from testbed.cli.ordering import At, When, order
+from testbed.errors import UsageError
 
-app = typer.Typer(help="Look at a run that goes, and change its estimators.", rich_markup_mode=None)
+app = typer.Typer(help="Look at a run that goes, and let events happen in it.", rich_markup_mode=None)
 
 _Estimator = Annotated[str, typer.Argument(metavar="ESTIMATOR", help="Name of an estimator of the run.")]
 _Own = Annotated[str, typer.Argument(metavar="NAME", help="Name of the new estimator in the results; one of its own.")]
@@ -42,6 +44,8 @@ def swap(
     ] = None,
     option: _Options = None,
     handover: _HandOver = None,
+    at: At = None,
+    when: When = None,
 ) -> None:
     """Let another service take over an estimator, from the first step on that is not granted when it is there.
 
@@ -52,7 +56,7 @@ def swap(
     if promote is not None and (option or handover):
         raise UsageError("--promote: allowed without --option and --handover; it has a state of its own")
     target: Any = promote if to is None else _service(to, option)
-    _do(context, {"action": "swap", "estimator": estimator, "to": target, "handover": handover})
+    order(context, {"action": "swap", "estimator": estimator, "to": target, "handover": handover}, at, when)
 
 
 @app.command()
@@ -63,22 +67,26 @@ def shadow(
     to: _Kind,
     option: _Options = None,
     handover: _HandOver = None,
+    at: At = None,
+    when: When = None,
 ) -> None:
     """Let an estimator run beside another one, from its state, under a name of its own."""
     event = {"action": "shadow", "estimator": estimator, "name": name, "to": _service(to, option)}
-    _do(context, {**event, "handover": handover})
+    order(context, {**event, "handover": handover}, at, when)
 
 
 @app.command()
-def add(context: typer.Context, name: _Own, to: _Kind, option: _Options = None) -> None:
+def add(
+    context: typer.Context, name: _Own, to: _Kind, option: _Options = None, at: At = None, when: When = None
+) -> None:
     """Add an estimator; it knows the prior of the scenario and no more."""
-    _do(context, {"action": "add", "estimator": name, "to": _service(to, option)})
+    order(context, {"action": "add", "estimator": name, "to": _service(to, option)}, at, when)
 
 
 @app.command()
-def remove(context: typer.Context, estimator: _Estimator) -> None:
+def remove(context: typer.Context, estimator: _Estimator, at: At = None, when: When = None) -> None:
     """Let an estimator leave."""
-    _do(context, {"action": "remove", "estimator": estimator})
+    order(context, {"action": "remove", "estimator": estimator}, at, when)
 
 
 @app.command()
@@ -93,7 +101,8 @@ def status(
     if json:
         typer.echo(json_format.dumps(found))
         return
-    typer.echo(f"{found['completed']} of {found['steps']} steps")
+    held = "" if found["held"] is None else f", held at step {found['held']}"
+    typer.echo(f"{found['completed']} of {found['steps']} steps{held}")
     for name, service in found["estimators"].items():
         typer.echo(f"{name}: {service['kind']}, {service['role']}")
     for event in found["events"]:
@@ -109,20 +118,32 @@ def stop(context: typer.Context) -> None:
     typer.echo(f"stopping after {found['completed']} of {found['steps']} steps")
 
 
+@app.command()
+def hold(
+    context: typer.Context,
+    step: Annotated[int | None, typer.Argument(min=0, metavar="[STEP]", help="Default: where the run is now.")] = None,
+) -> None:
+    """Let the clock of a run in virtual time not go beyond a step, until it is released."""
+    from testbed.orchestrator.running import ask
+
+    found = ask(context.obj, {"do": "hold"} if step is None else {"do": "hold", "step": step})
+    typer.echo(f"held at step {max(found['held'], found['granted'])}")
+
+
+@app.command()
+def release(context: typer.Context) -> None:
+    """Let the clock go on."""
+    from testbed.orchestrator.running import ask
+
+    found = ask(context.obj, {"do": "release"})
+    typer.echo(f"goes on after {found['completed']} of {found['steps']} steps")
+
+
 def _service(kind: str, options: list[str] | None) -> dict[str, Any]:
     from testbed.scenario.changes import parse_setting, together
 
     return {"kind": kind, **together([parse_setting(text) for text in options or []])}
 
 
-def _do(context: typer.Context, event: dict[str, Any]) -> None:
-    """Ask for a change, wait for it, and print from which step on it holds."""
-    from testbed.orchestrator.running import asking, outcome_of
-
-    run: Path = context.obj
-    with asking(run) as put:
-        number = put({"event": {key: value for key, value in event.items() if value is not None}})["number"]
-        happened = outcome_of(run, put, number)
-    if not happened.ok:
-        raise RunFailed(happened.text)
-    typer.echo(f"{happened.text}: from step {happened.step} on")
+for name, command in ctl_events.COMMANDS.items():
+    app.command(name)(command)

@@ -22,6 +22,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.command("run")(run.run)
+app.command("resume")(run.resume)
 app.command("analyze")(analyze.analyze)
 app.command("compare")(compare.compare)
 app.command("conformance")(conformance.conformance)

@@ -62,7 +62,9 @@ def _lines(packets: Path, lane: int, *, perfect: bool) -> list[str]:
 
     try:
         if packets.suffix == ".mcap":
-            return packets_of_recording(packets, lane, perfect_acks=perfect)
+            return packets_of_recording(
+                packets, lane, perfect_acks=perfect, say=lambda line: typer.echo(f"testbed: {line}", err=True)
+            )
         return (sys.stdin.read() if str(packets) == "-" else packets.read_text()).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"

@@ -6,6 +6,7 @@ from testbed.estimator.buffers import acks_of
 from testbed.estimator.registry import model_of
 from testbed.estimator.service import spec_of
 from testbed.scenario import LqgInput, Scenario
+from testbed.scenario.plant_events import PlantEvent
 from testbed.scenario.services import Planned
 
 WITH_ACKS = frozenset({"kfio", "oe", "oe-exact", "aoe", "gpb", "gpb1", "gpb2", "imm", "lmmse", "ff", "kf"})
@@ -45,6 +46,8 @@ def shortcomings(scenario: Scenario, source: LqgInput) -> list[str]:
         out.append("the actuator holds, and the gain is for one that applies zero")
     if source.low is not None or source.high is not None:
         out.append("the input has limits")
+    if any(isinstance(event, PlantEvent) for event in scenario.events):
+        out.append("the plant drifts away from its model")
     if scenario.uncertainty is not None:
         out.append("the plant departs from its model")
     unlike = [plan.step for plan in scenario.swaps if _replaces(plan, spec.name) and plan.handover != "full"]
@@ -56,4 +59,4 @@ def shortcomings(scenario: Scenario, source: LqgInput) -> list[str]:
 
 
 def _replaces(plan: Planned, name: str) -> bool:
-    return plan.event.action == "swap" and plan.event.estimator == name
+    return plan.replaces and plan.name == name

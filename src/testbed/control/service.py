@@ -13,8 +13,9 @@ from testbed.errors import RunFailed, UsageError
 from testbed.numerics.lanes import Floats
 from testbed.plant.inputs import open_loop
 from testbed.scenario import ClosedLoop, Following, PythonInput
+from testbed.scenario.plant_events import InputEvent
 from testbed.wire.codec import all_finite
-from testbed.wire.messages import ClockMessage, Control, EstimateMessage
+from testbed.wire.messages import Change, ClockMessage, Control, EstimateMessage
 from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.setup import Setup
 from testbed.wire.state import Unpacked, pack, unpack
@@ -47,6 +48,13 @@ class OpenLoopService:
         self._next = 0
         self.counters: dict[str, int] = {}
         node.on(node.keys.clock, ClockMessage, ORCHESTRATOR, self._tick)
+        node.on(node.keys.change(ROLE), Change, ORCHESTRATOR, self._change)
+
+    def _change(self, change: Change, _: dict[str, NDArray[Any]]) -> None:
+        """Take an order to send another input from a step on that is still to come; the orchestrator has checked it."""
+        event = InputEvent.model_validate(change.set)
+        for _lane, _lanes, source in self._sources:
+            source.change(change.step, event.input)
 
     @property
     def gives_state(self) -> bool:

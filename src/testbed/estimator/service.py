@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -9,15 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from testbed.errors import RunFailed, UsageError
+from testbed.estimator.appointments import Appointments, Form
 from testbed.estimator.buffers import acks_of, buffer_of
 from testbed.estimator.handover import give, start
 from testbed.estimator.model import Ack, Estimate, Estimator, Restartable, seen
+from testbed.estimator.outlet import Outlet
 from testbed.estimator.refilter import LateObservation, Refilter
 from testbed.estimator.registry import create, model_of
 from testbed.numerics.lanes import Floats
 from testbed.scenario import EstimatorSpec, Scenario
 from testbed.wire.codec import all_finite
-from testbed.wire.handover import Order, answered
+from testbed.wire.handover import Behind, Order, answered
 from testbed.wire.messages import Acknowledgement, Control, EstimateMessage, Observation, Packet
 from testbed.wire.node import OPEN, Gate, Node
 from testbed.wire.setup import Setup
@@ -46,6 +49,8 @@ class _Block:
         self.done = 0
         """Steps of which the estimate was given."""
         self.latest: Estimate | None = None
+        self.counted: dict[str, int] | None = None
+        """The counters, where what it does now is not to count."""
         self.refilter = Refilter(estimator, buffer if isinstance(estimator, Restartable) else 0)
         self._parts = parts
         self._waiting: dict[int, dict[str, dict[str, NDArray[Any]]]] = {}
@@ -63,15 +68,15 @@ class EstimatorService:
     def __init__(self, node: Node, setup: Setup, *, name: str, spec: EstimatorSpec | None = None) -> None:
         """spec: of one that joins while the run goes: it waits until it is told from where it starts."""
         scenario = setup.scenario
-        self._gate = Gate(None) if spec is not None else OPEN
+        self.gate = Gate(None) if spec is not None else OPEN
         if spec is None:
             spec = spec_of(scenario, name)
         acks = acks_of(scenario, spec)
         model = model_of(scenario)
         self._node, self._name, self._model = node, name, model
         self._noise = scenario.links.observation.on_loss == "noise"
-        self._until = spec.until or scenario.steps
-        self._send = node.sender(node.keys.estimate(name), EstimateMessage, gate=self._gate)
+        self.until = spec.until or scenario.steps
+        self.outlet = Outlet(name, node.sender(node.keys.estimate(name), EstimateMessage, gate=self.gate))
         self._blocks = {
             lane: _Block(
                 create(spec.kind, model, lanes=lanes, options=spec.options, lane=lane),
@@ -84,20 +89,30 @@ class EstimatorService:
         keys = node.keys
         take_u, take_y = partial(self._take, "u", 1), partial(self._take, "y", 0)
         take_ack = partial(self._take, "ack", 0)
-        gate = self._gate
+        gate = self.gate
         node.on(keys.sent("control"), Control, "controller", take_u, needs=("u",), gate=gate)
         node.on(keys.delivered("observation"), Observation, "link.observation", take_y, needs=("mask",), gate=gate)
         if acks == "perfect":
             node.on(keys.sent("ack"), Acknowledgement, "plant", take_ack, needs=("nu",), gate=gate)
         elif acks == "link":
             node.on(keys.delivered("ack"), Acknowledgement, "link.ack", take_ack, needs=("mask",), gate=gate)
-        node.bus.answer(keys.handover(node.name), partial(answered, self._ordered))
+        self._appointments: Appointments | None = None
+        if setup.real:
+            self._appointments = Appointments(node, self)
+        else:
+            node.bus.answer(keys.handover(node.name), partial(answered, self._ordered))
+        for order, data in node.begin.orders:
+            if order.action == "take":
+                self._ordered(order, data)
+            elif order.name is not None:
+                self.serve(order.name, order.step)
 
     @property
     def counters(self) -> dict[str, int]:
         total: dict[str, int] = {}
         for block in self._blocks.values():
-            for key, value in block.refilter.counters.items():
+            counters = block.refilter.counters if block.counted is None else block.counted
+            for key, value in counters.items():
                 total[key] = total.get(key, 0) + value
         return total
 
@@ -107,28 +122,57 @@ class EstimatorService:
 
     def state(self, lane: int) -> bytes:
         """A full snapshot, and the name under which the estimates go."""
-        block = self._blocks[lane]
-        snapshot = self._give(block, Order(action="give", step=block.done, form="full"))
-        return pack({"snapshot": _bytes(snapshot), "name": _bytes(self._name.encode())}, step=block.done)
+        snapshot, done = self.give(lane, "full"), self._blocks[lane].done
+        return pack({"snapshot": _bytes(snapshot), "name": _bytes(self.outlet.name_at(done).encode())}, step=done)
 
     def resume(self, lane: int, step: int, state: bytes) -> None:
         """Raises UsageError for what is no state of this estimator after so many steps."""
         given, block = unpack(state), self._blocks[lane]
-        done = min(step, self._until)
+        done = min(step, self.until)
         given.expect(step=done)
         snapshot, name = (given.array(part, np.uint8, None).tobytes() for part in ("snapshot", "name"))
         given.end()
         block.latest = start(block.refilter, "full", snapshot, model=self._model, lanes=block.lanes, step=done)
         block.done = done
-        if self._gate is not OPEN:
-            self._gate.passed_over = step
-        if name != self._name.encode():
-            self._serve(name.decode(), step)
+        if self.gate is not OPEN:
+            self.gate.passed_over = step
+        if name != self.outlet.name_at(step).encode():
+            self.serve(name.decode(), step)
 
-    def _serve(self, name: str, step: int) -> None:
+    def serve(self, name: str, step: int) -> None:
         """Let the estimates of step + 1 and later go under a name."""
-        self._name = name
-        self._send = self._node.sender(self._node.keys.estimate(name), EstimateMessage, gate=Gate(step))
+        send = self._node.sender(self._node.keys.estimate(name), EstimateMessage, gate=Gate(step))
+        self.outlet.turn(name, send, after=step)
+
+    def done(self) -> Mapping[int, int]:
+        """Steps that are done, by first lane of the block."""
+        return {lane: block.done for lane, block in self._blocks.items()}
+
+    def give(self, lane: int, form: Form) -> bytes:
+        """The state of a block, as a snapshot; not if cold."""
+        block = self._blocks[lane]
+        if form == "cold":
+            raise UsageError("a cold start needs no state")
+        estimate = block.latest or Estimate(*self._model.prior(block.lanes), block.lanes)
+        return give(block.refilter, form, step=block.done, estimate=estimate)
+
+    def start(self, lane: int, form: Form, data: bytes, step: int) -> None:
+        """Let a block that has done nothing go on after ``step``. Raises UsageError where it cannot."""
+        block = self._blocks[lane]
+        if block.done or self.gate is OPEN:
+            raise UsageError("asked to start anew in the middle")
+        block.latest = start(block.refilter, form, data, model=self._model, lanes=block.lanes, step=step)
+        block.done = step
+
+    def count_until_now(self, lane: int) -> None:
+        """Let the counters of a block be what they are now, whatever it still does."""
+        block = self._blocks[lane]
+        block.counted = dict(block.refilter.counters)
+
+    def count_on(self) -> None:
+        """Let all count again, and what they have counted since."""
+        for block in self._blocks.values():
+            block.counted = None
 
     def _ordered(self, order: Order, data: bytes) -> bytes:
         """Do what the orchestrator asks at a step at which the clock stands still."""
@@ -137,34 +181,31 @@ class EstimatorService:
             block = self._blocks.get(order.lane)
             if block is None:
                 raise UsageError(f"no block of lanes begins at {order.lane}")
-            return self._give(block, order) if order.action == "give" else self._start(block, order, data)
-        if any(block.done != min(step, self._until) for block in self._blocks.values()):
+            if order.action == "take":
+                self.start(order.lane, order.form, data, step)
+                self.gate.open(step)
+                return b""
+            if block.done != step:
+                raise UsageError(f"asked for the state after step {step}, and is at {block.done}")
+            return self.give(order.lane, order.form)
+        if any(block.done < min(step, self.until) for block in self._blocks.values()):
+            raise Behind
+        if any(block.done != min(step, self.until) for block in self._blocks.values()):
             raise UsageError(f"asked after step {step}, and is at another")
         if order.action == "leave":
             self._node.stopped = True
+        elif order.action == "ready":
+            return b""
         elif order.name is not None:
-            self._serve(order.name, step)
-        return b""
-
-    def _give(self, block: _Block, order: Order) -> bytes:
-        if block.done != order.step or order.form == "cold":
-            raise UsageError(f"asked for the state after step {order.step}, and is at {block.done}")
-        estimate = block.latest or Estimate(*self._model.prior(block.lanes), block.lanes)
-        return give(block.refilter, order.form, step=block.done, estimate=estimate)
-
-    def _start(self, block: _Block, order: Order, data: bytes) -> bytes:
-        if block.done or self._gate is OPEN:
-            raise UsageError("asked to start anew in the middle")
-        block.latest = start(block.refilter, order.form, data, model=self._model, lanes=block.lanes, step=order.step)
-        block.done = order.step
-        self._gate.passed_over = order.step
+            self.serve(order.name, step)
+            self.outlet.release()
         return b""
 
     def _take(self, part: str, ahead: int, packet: Packet, arrays: dict[str, NDArray[Any]]) -> None:
         step = packet.step + ahead
         if self._node.stopped:
             return
-        if step > self._until:
+        if step > self.until:
             if part == "y":
                 self._node.done(step, packet.lane)
             return
@@ -188,8 +229,10 @@ class EstimatorService:
         if estimate.error_bound is not None and estimate.error_bound_P is not None:
             arrays |= {"error_bound": estimate.error_bound, "error_bound_P": estimate.error_bound_P}
         block.done, block.latest = step, estimate
-        self._send(step, lane, block.lanes, arrays)
+        self.outlet(step, lane, block.lanes, arrays)
         self._node.done(step, lane)
+        if self._appointments is not None:
+            self._appointments.done(step, lane)
 
 
 def _acks(step: int, arrays: dict[str, NDArray[Any]] | None) -> tuple[Ack, ...]:

@@ -16,7 +16,15 @@ from testbed.numerics.lanes import Component, Matrix, Vector, matrix_of, vector_
 from testbed.orchestrator.cost import CostBook
 from testbed.orchestrator.lane_windows import window_ends
 from testbed.orchestrator.lanes_file import LaneFigures
-from testbed.orchestrator.statistics import ERROR_FIGURES, LANE_FIGURES, Arrays, Series, error_figures, prepare
+from testbed.orchestrator.statistics import (
+    ERROR_FIGURES,
+    LANE_FIGURES,
+    Arrays,
+    Figures,
+    Series,
+    error_figures,
+    prepare,
+)
 from testbed.wire.setup import Setup
 from testbed.wire.state import pack, unpack
 
@@ -72,6 +80,8 @@ class Collector:
         )
         self._plan()
         self._steps: dict[int, _Step] = {}
+        self.watch: Callable[[str, int, int, Figures], None] = lambda name, step, lane, figures: None
+        """Called with the figures of each estimator, step and block of lanes, as they come."""
 
     def prepare(self) -> None:
         """What would hold up the first step: make it now."""
@@ -81,14 +91,20 @@ class Collector:
     def expect(self, name: str, first: int, last: int) -> None:
         """Let the estimates of a name be due until step ``last``, and of a new one from ``first`` on.
 
-        What is granted already must not change by it.
+        What is complete already must not change by it.
         """
         if name not in self._until:
             self._first[name], self._words[name] = first, f"estimate of {name}"
             self.estimators[name] = series = self._new_series()
             series.begin_at(first, self.completed)
         self._until[name] = last
-        self._plan()
+        self._plan_again()
+
+    def forget(self, name: str) -> None:
+        """Let a name that was to have estimates, and has none yet, have none."""
+        for of in (self._first, self._until, self._words, self.estimators):
+            of.pop(name)
+        self._plan_again()
 
     @property
     def finished(self) -> bool:
@@ -273,7 +289,9 @@ class Collector:
         return struck
 
     def _reduce(self, name: str, step: int, lane: int, x: Vector, x_hat: Vector, P: Matrix) -> None:
-        self.estimators[name].add(step, lane, error_figures(x, x_hat, P))
+        figures = error_figures(x, x_hat, P)
+        self.estimators[name].add(step, lane, figures)
+        self.watch(name, step, lane, figures)
 
     def _new_series(self) -> Series:
         return Series(ERROR_FIGURES, self._setup.scenario.lanes, kept=len(LANE_FIGURES), ends=self._windows)
@@ -304,6 +322,19 @@ class Collector:
         self._ends = sorted({*self._until.values(), *begins, self._bounds_until, self._count})
         self._parts = [self._parts_at(end) for end in self._ends]
 
+    def _plan_again(self) -> None:
+        """What each step consists of, those included of which something has come."""
+        self._plan()
+        for step, record in self._steps.items():
+            parts, _ = self._parts_at(step)
+            for part in record.parts ^ parts:
+                missing = sum((lane, part) not in record.come for lane in self._blocks)
+                change = missing if part in parts else -missing
+                record.outstanding += change
+                record.gate += change
+            record.parts = parts
+        self._advance()
+
     def _done(self, record: _Step, lane: int, part: str) -> None:
         record.come.append((lane, part))
         record.outstanding -= 1
@@ -311,6 +342,7 @@ class Collector:
             self._advance()
 
     def _advance(self) -> None:
+        """To the first step of which something has not come."""
         steps = self._steps
         while (following := steps.get(self.completed + 1)) is not None and not following.outstanding:
             self.completed += 1

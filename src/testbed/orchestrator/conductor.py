@@ -3,40 +3,36 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal, cast, get_args
+from typing import Annotated, Any, Literal, cast, get_args
 
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from testbed.channel.real.check import check_link
 from testbed.channel.service import role_of as link_role
 from testbed.control.service import ROLE as CONTROLLER
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.bounds_service import ROLE as BOUNDS
 from testbed.orchestrator.collect import Collector
 from testbed.orchestrator.pacing import Pacing
-from testbed.orchestrator.preflight import plan_of
 from testbed.orchestrator.recorder import Recorder
 from testbed.orchestrator.recovery import Recovery
 from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Services
+from testbed.orchestrator.services_in_time import ServicesInTime
 from testbed.orchestrator.summary import Happened
+from testbed.orchestrator.timeline import Timeline
 from testbed.orchestrator.watchdog import Watchdog
 from testbed.plant.service import ROLE as PLANT
-from testbed.scenario.changes import in_turn
-from testbed.scenario.events import LinkEvent
 from testbed.scenario.recovery import Policy
-from testbed.wire.begin import AT_START
+from testbed.wire.begin import AT_START, Begin
 from testbed.wire.bus import Bus
 from testbed.wire.codec import Rejected, encode
 from testbed.wire.keys import LinkName
 from testbed.wire.messages import (
     Acknowledgement,
     BoundsMessage,
-    Change,
     ClockMessage,
     Command,
     Control,
@@ -52,15 +48,24 @@ from testbed.wire.setup import Setup
 Arrays = dict[str, NDArray[Any]]
 
 
+_LINKS: dict[LinkName, tuple[type[Packet], str]] = {
+    "control": (Control, CONTROLLER),
+    "observation": (Observation, PLANT),
+    "ack": (Acknowledgement, PLANT),
+}
+"""What goes over a link, and who sends it."""
+
+
 class Asked(BaseModel):
-    """What somebody asks of a run that goes: to change a link, a change of estimators, how it is, or to stop."""
+    """What somebody asks of a run that goes: to change a link, an event, to hold the clock, how it is, or to stop."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     link: str | None = None
     set: dict[str, Any] | None = None
     event: dict[str, Any] | None = None
-    do: Literal["status", "stop"] | None = None
+    do: Literal["status", "stop", "hold", "release"] | None = None
+    step: Annotated[int, Field(ge=0)] | None = None
 
 
 class Conductor:
@@ -76,46 +81,52 @@ class Conductor:
         roles: Sequence[RoleSpec],
         recorder: Recorder | None,
         policies: Mapping[str, Policy] | None = None,
+        begin: int = 0,
     ) -> None:
-        """policies: what becomes of a role that is lost; of one that is not among them, the run fails."""
+        """policies: what becomes of a role that is lost; of one that is not among them, the run fails.
+
+        begin: the step after which the run goes on.
+        """
         self.setup, self.collector = setup, Collector(setup)
         self.failure: str | None = None
         self.reports: dict[str, Status] = {}
-        self.stop_asked = False
-        """Somebody outside asked for the end."""
+        self.stop_asked = ""
+        """Why the run is to end before its end; empty: nobody asked for it."""
         self.activity = 0
         """Grows with every message that was of use."""
         self.on_started: Callable[[], None] = lambda: None
+        self.on_progress: Callable[[], None] = lambda: None
+        """Called when all roles are there, when steps are complete, and when events are decided."""
         self.say: Callable[[str], None] = lambda line: None
         self._roles = [role.name for role in roles]
         self._present: set[str] = set()
         self._gone: list[str] = []
         """Roles that have left as they should."""
-        self._begun = False
+        self._begun = self._going = False
         self._granted = 0
+        self._told = 0
         self._steps, self._credit = setup.scenario.steps, setup.credit
         self._stopping = False
         self._recorder = recorder
-        self.node = setup.join(bus, ORCHESTRATOR)
+        self.recorded: list[str] = []
+        """The topics of the links that are recorded."""
+        self.node = setup.join(bus, ORCHESTRATOR, Begin(begin))
         self._commands = 0
         self._command = bus.publisher(self.node.keys.command)
         self.pacing = Pacing(bus, setup, self.collector, self._grant, self.fail) if setup.real else None
-        self._tell_link = {link: bus.publisher(self.node.keys.change(link)) for link in get_args(LinkName)}
+        parts = bus, setup, self.collector, lambda line: self.say(line)
+        self.services = Services(*parts) if self.pacing is None else ServicesInTime(*parts, self.pacing)
+        self.timeline = Timeline(bus, setup, self.collector, self.services, lambda line: self.say(line))
         self._clock = bus.publisher(self.node.keys.clock)  # behind the others: what is held back is sent in this order
         self._clock_seq = 0
-        self._changes: Counter[str] = Counter()
-        self.events = [
-            Happened(step=event.step(setup.scenario.clock.period_ns), by="timeline", link=event.link, set=event.set)
-            for event in setup.scenario.events
-            if isinstance(event, LinkEvent)
-        ]
-        """Which links change, or have changed, at which step."""
-        self.services = Services(bus, setup, self.collector, lambda line: self.say(line))
         self.services.watch, self.services.joins = self._watch, self._joins
         self.services.leaves, self.services.failed = self._leaves, self.fail
         self.recovery = Recovery(setup, self.collector, self.services, roles, dict(policies or {}))
         self.recovery.forget = lambda step: self._order("forget", step)
+        self.recovery.changes = lambda role: self.timeline.told_to(role.removeprefix("link."))
         self.recovery.missed, self.recovery.rejected = self._missed, self.node.rejected
+        self.services.retry, self.services.comes_back = self._advance_soon, self._comes_back
+        self.services.taken, self.services.served = self.recovery.taken, self.recovery.served
         self.ending: Callable[[str], str | None] = lambda role: None
         """How a role's process has ended, if it has."""
         self.watchdog = Watchdog(setup, self.collector, lambda: self._order("ping"))
@@ -137,6 +148,23 @@ class Conductor:
         return self.collector.finished or self.failure is not None
 
     @property
+    def granted(self) -> int:
+        """The last step that the clock has let begin."""
+        return self._granted
+
+    @property
+    def resting(self) -> bool:
+        """Whether everything is done up to the step at which the clock is held."""
+        held = self.timeline.held_at
+        return self._begun and held is not None and self.collector.completed >= held
+
+    @property
+    def held_at(self) -> int | None:
+        """The step beyond which the clock does not go, and that it has reached; None where it goes on."""
+        held = self.timeline.held_at
+        return self._granted if held is not None and self._granted >= held else None
+
+    @property
     def missing(self) -> list[str]:
         """Roles that are not there."""
         return [role for role in self._roles if role not in self._present]
@@ -152,6 +180,10 @@ class Conductor:
             return f"a service of {self.services.pending[0].plan.event.estimator} to join"
         return self.collector.awaiting() if self.started else f"roles to join: {', '.join(self.missing)}"
 
+    def outcome(self, number: int) -> Happened | None:
+        """What became of an order; None as long as that is to come."""
+        return next((e for e in self.timeline.happened(self._granted + 1) if e.number == number), None)
+
     def change_link(self, link: str, change: dict[str, Any]) -> int:
         """Let keys of a link have other values from the next step on that is not granted yet; that step.
 
@@ -160,65 +192,82 @@ class Conductor:
         names = get_args(LinkName)
         if link not in names:
             raise UsageError(f"link {link!r}: no such link; allowed: {', '.join(names)}{did_you_mean(link, names)}")
-        name = cast(LinkName, link)
-        if link_role(name) not in self._roles:
+        if link_role(cast(LinkName, link)) not in self._roles:
             raise UsageError(f"link {link!r}: this run has none")
+        self._check_going()
+        self.timeline.order({"action": "set", "link": link, "set": change}, self._granted)
+        return self._granted + 1
+
+    def order(self, event: dict[str, Any]) -> int:
+        """Let an event happen, given as in a scenario; without ``at`` and ``when`` as soon as can be. Its number.
+
+        Raises UsageError where that cannot be.
+        """
+        if not self.started:
+            raise UsageError(f"the run has not begun; waiting for {self.awaiting()}")
+        self._check_going()
+        number = self.timeline.order(event, self._granted)
+        self._advance()
+        return number
+
+    def hold(self, step: int) -> None:
+        """Let the clock not go beyond a step, or beyond what is granted already.
+
+        Raises UsageError in real time, but for step 0 before it begins.
+        """
+        if self.pacing is not None and (step or self._going):
+            raise UsageError("the run keeps real time, which cannot be held; allowed: in virtual time")
+        self.timeline.held_at = step
+        self._go()
+
+    def release(self) -> None:
+        """Let the clock go on."""
+        self.timeline.held_at = None
+        self._go()
+
+    def _go(self) -> None:
+        """Begin, unless the clock is held at the beginning, or go on."""
+        if not self._begun or self._stopping:
+            return
+        if not self._going and self.timeline.held_at != 0:
+            self._going = True
+            self.on_started()
+            if self.pacing is not None:
+                self.pacing.begin()
+                self.timeline.begin_real(self.node.bus.clock.monotonic_of(self.pacing.times.start_ns))
+        self._advance()
+
+    def _check_going(self) -> None:
         if self.over or self._granted >= self._steps:
             raise UsageError("the run has no step left that could change")
-        event = Happened(step=self._granted + 1, by="command", link=link, set=change)
-        events = sorted((e for e in [*self.events, event] if e.link == link), key=lambda e: e.step)
-        after = in_turn(getattr(self.setup.scenario.links, link), [e.set or {} for e in events])
-        check_link(self.setup.scenario, name, after[-1])
-        if any(variant.takes_time for variant in after) and not self.setup.scenario.takes_time(name):
-            raise UsageError(
-                f"link {link!r} began without time: allowed in this run: another loss; for more, begin with a delay, "
-                "such as { kind = 'constant', by = '0 s' }"
-            )
-        order = Change(run=self.setup.run, source=ORCHESTRATOR, seq=self._changes[link], step=event.step, set=change)
-        self._changes[link] += 1
-        self.events.append(event)
-        self._tell_link[name](encode(order))
-        return event.step
 
     def _asked(self, question: bytes) -> bytes:
         """Answer what somebody asks of the run: {"link": …, "set": {…}}; with {"step": k}, or {"error": …}.
 
-        {"event": {…}} is an event without ``at``; with {"number": n}. {"do": "status"} and {"do": "stop"}; with status.
+        {"event": {…}} is an event as in a scenario; with {"number": n}. {"do": "hold", "step": k}, {"do": "release"},
+        {"do": "status"} and {"do": "stop"}; with status.
         """
         try:
             asked = Asked.model_validate_json(question)
             if asked.event is not None:
-                return json.dumps({"number": self.change_estimators(asked.event)}).encode()
+                return json.dumps({"number": self.order(asked.event)}).encode()
             if asked.do == "stop":
-                self.stop_asked = True
+                self.end("stopped by command")
+            elif asked.do == "hold":
+                self.hold(asked.step if asked.step is not None else self._granted)
+            elif asked.do == "release":
+                self.release()
             if asked.do is not None:
                 return json.dumps(self.status()).encode()
             return json.dumps({"step": self.change_link(asked.link or "", asked.set or {})}).encode()
         except (UsageError, ValidationError) as error:
             return json.dumps({"error": " ".join(str(error).split())}).encode()
 
-    def change_estimators(self, event: dict[str, Any]) -> int:
-        """Let an event of estimators, without ``at``, happen as soon as its service is there; its number.
-
-        Raises UsageError where that cannot be.
-        """
-        if not self.started:
-            raise UsageError(f"the run has not begun; waiting for {self.awaiting()}")
-        if self.pacing is not None:
-            raise UsageError(
-                "the run keeps real time, which does not wait for a new estimator; allowed: in virtual time"
-            )
-        if self.over or self._granted >= self._steps:
-            raise UsageError("the run has no step left that could change")
-        plan = plan_of(self.setup, self.services, event, self._granted + 1)
-        number = self.services.add(plan)
-        self._advance()
-        return number
-
     def status(self) -> dict[str, Any]:
         """How far the run is, who estimates, and what has happened."""
         at = self._granted
-        roles = {name: self.services.role_at(name, at) for name in self.services.turns}
+        future = [e for e in self.timeline.happened(self._steps) if e.step > at + 1 and e.by != "timeline"]
+        roles = {name: self.services.role_at(name, max(at, 1)) for name in self.services.turns}
         return {
             "completed": self.collector.completed,
             "granted": at,
@@ -228,38 +277,51 @@ class Conductor:
                 for name, role in roles.items()
                 if role is not None
             },
-            "pending": [entry.number for entry in self.services.pending],
-            "events": [
-                event.model_dump(mode="json", exclude_none=True)
-                for event in sorted([*self.events, *self.services.happened], key=lambda event: event.step)
-                if event.step <= at + 1 or not event.ok
-            ],
+            "held": self.timeline.held_at,
+            "pending": sorted(self.timeline.numbers | {e.number for e in future if e.number is not None}),
+            "events": [event.model_dump(mode="json", exclude_none=True) for event in self.timeline.happened(at + 1)],
         }
 
     @property
     def happened(self) -> list[Happened]:
         """What has changed so far, in order of time; what was refused is among it."""
-        done = [e for e in self.events if e.step <= self.collector.completed]
-        done += [e for e in self.services.happened if e.step <= self.collector.completed or not e.ok]
-        return sorted(done, key=lambda e: e.step)
+        return self.timeline.happened(self.collector.completed)
 
     def tick(self, deadline_s: float) -> None:
         """From time to time: launch what will be needed, and give up what does not come."""
         if self.started and not self.over:
             self.recovery.proceed()
-            busy = bool(self.recovery.down)
+            busy = bool(self.recovery.down) or self.resting
             for role in self.watchdog.hung(self._present - {role for role in self._present if self._fails(role)}, busy):
                 self._is_lost(role, f"gave no sign of life for {self.watchdog.patience_s:g} s")
-        if self.services.pending and self.started and not self.over:
+        if self.resting:
+            self.activity += 1  # who holds the clock knows that nothing moves
+        if self.timeline.pending and not self.over:
             if self.services.overdue(deadline_s):
                 self.activity += 1
-            self._advance()
+            if self.started:
+                self._advance()
+                self.on_progress()
+            else:
+                self._begin()
 
     def ended(self, role: str, how: str) -> None:
         """A role's process has ended; fail unless it has reported, can be recovered, or was not in charge yet."""
+        if self.services.deciding(role):
+            return  # what it has sent comes before the news that it is gone
         if role not in self.reports and role not in self._gone:
             self.recovery.down.pop(role, None)
             self._is_lost(role, f"ended: {how}")
+
+    def restart(self, role: str) -> None:
+        """Start a role anew. Raises UsageError where the scenario does not let that be."""
+        if self.recovery.policy(role) != "restart":
+            raise UsageError(f"{role} cannot be started anew: its policy of recovery is {self.recovery.policy(role)}")
+        self._is_lost(role, "was restarted")
+
+    def end(self, reason: str) -> None:
+        """Somebody asks for the end before the end; the first reason stays."""
+        self.stop_asked = self.stop_asked or reason
 
     def stop(self) -> None:
         """Tell all roles to report and leave."""
@@ -282,8 +344,22 @@ class Conductor:
             self._take_estimates(spec.name, OPEN)
         if scenario.bounds:
             node.on(keys.bounds, BoundsMessage, BOUNDS, self._bounds)
+        for link in self.timeline.links_watched:
+            self._count(cast(LinkName, link))
         if self._recorder is not None or self.pacing is not None:
             self._subscribe_for_recording()
+
+    def _count(self, link: LinkName) -> None:
+        """Tell conditions what becomes of the packets of a link; that of u_{k−1} counts at step k."""
+        model, _ = _LINKS[link]
+        ahead = 1 - model.FIRST_STEP
+
+        def count(packet: Packet, arrays: Arrays) -> None:
+            arrived = int(arrays["mask"].sum())
+            self.timeline.count(link, packet.step + ahead, packet.lane, packet.lanes, packet.lanes - arrived)
+            self._advance()
+
+        self.node.on(self.node.keys.delivered(link), model, link_role(link), count, needs=("mask",))
 
     def _take_estimates(self, name: str, gate: Gate) -> None:
         def is_due(packet: EstimateMessage) -> bool:
@@ -320,6 +396,7 @@ class Conductor:
             return False
         self.activity += 1
         self._advance()
+        self.on_progress()
         return True
 
     def _listen(self, role: str) -> None:
@@ -330,8 +407,34 @@ class Conductor:
 
     def _begin_of(self, role: bytes) -> bytes:
         name = role.decode(errors="replace")
-        late = self.started and name in self.recovery.specs
-        return (self.recovery.begin(name, late=True) if late else AT_START).to_bytes()
+        known = name in self.recovery.specs
+        return (self.recovery.begin(name, late=self.started) if known else AT_START).to_bytes()
+
+    def begin_after(self, step: int, reports: Mapping[str, Status]) -> None:
+        """Go on after a step; reports: the last words of roles that have left before."""
+        self._granted = step
+        self.reports.update(reports)
+        self._gone += reports
+        for name in self.services.turns:
+            if name not in {spec.name for spec in self.setup.scenario.estimators}:
+                self._take_estimates(name, OPEN)
+
+    @property
+    def last_words(self) -> dict[str, Status]:
+        """Of roles that have left."""
+        return {role: self.reports[role] for role in self._gone if role in self.reports}
+
+    @property
+    def awaited_words(self) -> bool:
+        """Whether a role that has left has not reported yet."""
+        return any(role in self._present and role not in self.reports for role in self._gone)
+
+    def _advance_soon(self) -> None:
+        self.activity += 1
+        self.node.bus.call(self._advance)
+
+    def _comes_back(self, role: str) -> bool:
+        return self.recovery.policy(role) == "restart"
 
     def _fails(self, role: str) -> bool:
         return self.recovery.policy(role) == "fail"
@@ -358,10 +461,13 @@ class Conductor:
     def _is_back(self, role: str) -> None:
         """A role that was started anew is there: tell it what it has not heard."""
         self.recovery.back(role)
+        self.timeline.tell_again(role.removeprefix("link."))
         if self._granted:
             self._grant(self._granted, None if self.pacing is None else self.pacing.times.start_ns)
         if self._stopping:
             self._order("stop")
+        elif self.started:
+            self._advance()
 
     def _order(self, action: Literal["stop", "ping", "forget"], step: int | None = None) -> None:
         command = Command(run=self.setup.run, source=ORCHESTRATOR, seq=self._commands, action=action, step=step)
@@ -370,18 +476,14 @@ class Conductor:
 
     def _subscribe_for_recording(self) -> None:
         keys = self.node.keys
-        types: dict[LinkName, tuple[type[Packet], str]] = {
-            "control": (Control, CONTROLLER),
-            "observation": (Observation, PLANT),
-            "ack": (Acknowledgement, PLANT),
-        }
         for link in get_args(LinkName):
-            model, sender = types[link]
+            model, sender = _LINKS[link]
             self._record(keys.sent(link), model, sender, f"{link}/sent")
             if link_role(link) in self._roles:
                 self._record(keys.delivered(link), model, link_role(link), f"{link}/delivered")
 
     def _record(self, key: str, model: type[Packet], source: str, topic: str) -> None:
+        self.recorded.append(topic)
         whole = self.setup.real or self.setup.tap >= self.setup.sizes.lanes
         taken = key if whole else self.node.keys.tap(key)
         self.node.on(taken, model, source, partial(self._write, topic), cut=not whole)
@@ -396,7 +498,10 @@ class Conductor:
         role = key.rsplit("/", 1)[1]
         if alive and self.services.here(role):
             self.activity += 1
-            self._advance()
+            if self.started:
+                self._advance()
+            else:
+                self._begin()
             return
         if not alive and not self._stopping and self._lost(role, f"{role} is gone"):
             self._present.discard(role)
@@ -413,13 +518,14 @@ class Conductor:
         self.activity += 1
         if role in self.recovery.down:
             self._is_back(role)
-        if not self.missing and not self.started:
+        self._begin()
+
+    def _begin(self) -> None:
+        """Once everybody is there."""
+        if not self.started and self.services.all_are_there() and not self.missing:
             self._begun = True
-            self.on_started()
-            if self.pacing is not None:
-                self.pacing.begin()
-            else:
-                self._advance()
+            self.on_progress()
+            self._go()
 
     def _status(self, role: str, status: Status, _: Arrays) -> None:
         if status.state == "alive":
@@ -444,25 +550,34 @@ class Conductor:
     def _collected(self, topic: str, packet: Packet, arrays: Arrays) -> None:
         self.activity += 1
         self._write(topic, packet, arrays)
+        if self.collector.completed != self._told:
+            self._told = self.collector.completed
+            self.on_progress()
         self._advance()
 
     def _advance(self) -> None:
         """Grant the steps that may be in flight, several at a time, up to where estimators change.
 
-        In real time the clock does.
+        In real time the clock does. While a role is started anew nothing is granted or changed.
         """
+        if self.recovery.down:
+            return
         if self.pacing is not None:
+            self.timeline.proceed_real(self._granted, self.collector.estimated)
+            if self.services.pending and not self.over:
+                self.services.proceed(self._granted, self.collector.estimated)
             return
         self._grant_more()
         while (
-            self.services.pending and not self.over and self.services.proceed(self._granted, self.collector.estimated)
+            self.timeline.pending and not self.over and self.timeline.proceed(self._granted, self.collector.estimated)
         ):
             self._grant_more()
+            self.on_progress()
 
     def _grant_more(self) -> None:
         steps, credit = self._steps, self._credit
-        if self.services.pending:
-            steps = self.services.limit(steps)
+        if self.timeline.pending:
+            steps = self.timeline.limit(steps)
         target = min(steps, self.collector.estimated + credit)
         if target > self._granted and (target == steps or target - self._granted >= max(1, credit // 4)):
             self._grant(target)

@@ -33,6 +33,7 @@ from testbed.orchestrator.summary import (
     ControllerFigures,
     CostFigures,
     EstimatorFigures,
+    Happened,
     LinkFigures,
     Summary,
     Timing,
@@ -59,7 +60,9 @@ def summarise(conductor: Conductor, *, status: str, reason: str | None, timing: 
     bounds = _bounds(conductor)
     complete, happened = status == "complete", conductor.happened
     unlike = {e.estimator: e.step for e in reversed(happened) if e.action == "swap" and e.ok and e.handover != "full"}
-    checks = [*moment_checks(scenario), *between_bounds(scenario, estimators, bounds, unlike)]
+    moved = drifts_from(happened)
+    checks = [*(moment_checks(scenario) if moved is None else drift_checks(moved))]
+    checks += between_bounds(scenario, estimators, bounds, unlike)
     checks += rounding(collector.largest_state, estimators)
     pacing = conductor.pacing
     realtime = None if pacing is None else pacing.figures(conductor.reports.get(CONTROLLER))
@@ -140,6 +143,20 @@ def link_figures(counters: dict[str, int]) -> LinkFigures:
         loss_rate=(sent - min(sent, counters["delivered"] + counters.get("in_flight", 0))) / sent if sent else None,
         mean_burst=(counters["00"] + bursts) / bursts if bursts else None,
     )
+
+
+def drifts_from(happened: Sequence[Happened]) -> int | None:
+    """The first step at which the plant is not that of the model any more; None where it always is."""
+    return min((event.step for event in happened if event.action == "plant" and event.ok), default=None)
+
+
+def drift_checks(first: int) -> list[Check]:
+    """What stands in place of statements on the long run, where the plant leaves its model."""
+    text = (
+        f"skipped: from step {first} on the plant is not the model of the estimators, so that nothing is known of the "
+        "long run, and errors beyond what they claim are the effect of the drift"
+    )
+    return [Check(name="finite mean", ok=True, text=text)]
 
 
 def moment_checks(scenario: Scenario) -> list[Check]:
@@ -305,9 +322,16 @@ def _controller(conductor: Conductor) -> ControllerFigures | None:
         kind=source.kind,
         estimator=source.estimator,
         gain=gain,
-        statement=statement(scenario),
+        statement=_statement(conductor),
         counters={name: n for name, n in counters.items() if not name.startswith("held")},  # those are in `realtime`
     )
+
+
+def _statement(conductor: Conductor) -> str | None:
+    said = statement(conductor.setup.scenario)
+    if said is None or drifts_from(conductor.happened) is None or not said.startswith("optimal"):
+        return said
+    return "not optimal: the plant drifts away from its model"
 
 
 def _cost(conductor: Conductor) -> CostFigures | None:
@@ -347,11 +371,24 @@ def _bounds(conductor: Conductor) -> BoundFigures | None:
         upper["upper_correlated_mean"] = series.mean["upper_correlated"]
         upper["upper_correlated_stderr"] = series.stderr["upper_correlated"]
     reason: str | None = None
+    foreign = next(
+        (e.step for e in conductor.happened if e.action == "input" and e.ok and not _foreseen(e, scenario)), None
+    )
+    if foreign is not None:
+        reason = f"from step {foreign} on the input is one that the scenario does not have, and U does not cover it"
     if law_of_link(scenario, "control").covariance_factor is None:
         reason = "the control losses never mix, and S holds for independent ones"
+    moved = drifts_from(conductor.happened)
+    if moved is not None:
+        reason = f"the bounds are those of the model, and the plant departs from it at step {moved}"
     if scenario.uncertainty is not None:
         reason = "the bounds are those of the nominal model, and the plant departs from it"
     return BoundFigures.model_validate({**lower, **upper, "upper_reason": reason})
+
+
+def _foreseen(event: Happened, scenario: Scenario) -> bool:
+    """Whether an event of the scenario brought it, so that the bounds know of it."""
+    return event.number is not None and event.number < len(scenario.events)
 
 
 _SILENT = Status(run="00000000", source="none", seq=0, state="stopped")

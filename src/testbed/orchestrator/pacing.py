@@ -69,6 +69,10 @@ class Pacing:
             held_steps_max=counters.get("held_steps", 0),
         )
 
+    def due_in(self, ahead_ns: int) -> int:
+        """Steps whose control is due by then."""
+        return self.times.due(self._now() + ahead_ns) if self._start_ns else 0
+
     def _now(self) -> int:
         """The date, as it goes on from the start if nobody sets it."""
         return self.times.start_ns + self._bus.clock.monotonic_ns() - self._start_ns

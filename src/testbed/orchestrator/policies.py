@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from testbed.control.controller import RestartableController
 from testbed.control.registry import create as create_controller
@@ -17,19 +17,29 @@ from testbed.scenario.backend import real_links
 from testbed.scenario.recovery import Policy, role_name
 
 
-def policies_of(scenario: Scenario, roles: Sequence[RoleSpec], external: Sequence[str] = ()) -> dict[str, Policy]:
+def policies_of(
+    scenario: Scenario,
+    roles: Sequence[RoleSpec],
+    external: Sequence[str] = (),
+    services: Mapping[str, EstimatorSpec] | None = None,
+) -> dict[str, Policy]:
     """By role. external: roles that somebody starts by hand; they are lost for good unless the scenario says otherwise.
+
+    services: the estimators of roles that are not in the scenario.
 
     Raises UsageError where the scenario names a role that it has not, or asks for what cannot be.
     """
-    names = [role.name for role in roles]
+    names = [role.name for role in roles if role.name not in (services or {})]
+    known = {*names, *map(role_name, services or ()), *(role_of(spec.name) for spec in scenario.estimators)}
     for role in scenario.recovery.roles:
-        if role not in names:
+        if role not in known:
             raise UsageError(f"recovery.roles: got {role!r}; allowed: {', '.join(names)}")
     out: dict[str, Policy] = {}
     for role in names:
         spec = spec_of(scenario, role.removeprefix(_ESTIMATOR)) if role.startswith(_ESTIMATOR) else None
         out[role] = _policy(scenario, role, unable(scenario, role, spec), external=role in external)
+    for role, service in (services or {}).items():
+        out[role] = policy_of_service(scenario, role, service)
     return out
 
 

@@ -30,7 +30,7 @@ class StageTimes:
     arrived: list[int] = field(default_factory=list)
     come: dict[int, int] = field(default_factory=dict)
     whole: int = 0
-    """Steps of which all packets have come, in order."""
+    """Steps of which all packets have come, in order, and those before the first that it has."""
     missed: int = 0
     first_missed: int | None = None
 
@@ -60,7 +60,7 @@ class Punctuality:
         self.start_ns = 0
         """The date at which u_0 is due."""
         self.outstanding_max = 0
-        self._clock, self._steps = scenario.clock, scenario.steps
+        self._clock, self._steps, self._blocks = scenario.clock, scenario.steps, blocks
         self.stages: dict[str, StageTimes] = {}
 
         def add(topic: str, role: str, before: str | None, what: str, last: int = scenario.steps) -> None:
@@ -75,6 +75,32 @@ class Punctuality:
         for spec in scenario.estimators:
             last = spec.until or scenario.steps
             add(f"estimate/{spec.name}", estimator_role(spec.name), "observation/delivered", "estimate", last)
+
+    def serve(self, name: str, role: str, first: int, last: int) -> None:
+        """From step ``first`` on a role gives the estimates of a name, which may be new."""
+        topic = f"estimate/{name}"
+        stage = self.stages.get(topic)
+        if stage is None:
+            stage = StageTimes(role, "observation/delivered", "estimate", last, self._blocks, whole=first - 1)
+            self.stages[topic] = stage
+        stage.role, stage.last = role, last
+
+    def forget(self, name: str) -> None:
+        """A name that was to have estimates has none."""
+        self.stages.pop(f"estimate/{name}", None)
+
+    def ends(self, name: str, last: int) -> None:
+        """There are no estimates of a name after step ``last``."""
+        self.stages[f"estimate/{name}"].last = last
+
+    def after(self, name: str, step: int, count: int) -> tuple[float | None, int]:
+        """Of so many estimates of a name from ``step`` on: the largest lateness after t_k, in ms, and how many missed.
+
+        None where none of them has come.
+        """
+        times = self.stages[f"estimate/{name}"].published[step - 1 : step - 1 + count]
+        come = [ns for ns in times if ns != NEVER]
+        return max(come) / 1e6 if come else None, sum(ns > self._clock.deadline_ns for ns in come)
 
     def due(self, now_ns: int) -> int:
         """Steps whose control was due by a date."""

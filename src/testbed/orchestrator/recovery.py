@@ -10,14 +10,17 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from math import inf
 
 from testbed.errors import TestbedError, UsageError
 from testbed.estimator.service import role_of
 from testbed.orchestrator.collect import Collector
+from testbed.orchestrator.policies import policy_of_service
 from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Services
 from testbed.orchestrator.summary import Recovered
-from testbed.scenario.recovery import Policy
+from testbed.scenario import EstimatorSpec
+from testbed.scenario.recovery import Policy, role_name
 from testbed.wire.begin import Begin, Given
 from testbed.wire.bundle import unbundle
 from testbed.wire.handover import Order
@@ -34,7 +37,7 @@ class Checkpoint:
 
 @dataclass
 class _Origin:
-    """Of an estimator's service that joined on the way: after which step, and what it was told."""
+    """Of an estimator's service that joined on the way: after which step, and what it was told for that."""
 
     step: int
     orders: list[tuple[Order, bytes]]
@@ -52,8 +55,8 @@ class Recovery:
     """Policies, states and restarts.
 
     ``launch`` starts a role again, and ends what is left of its process; it may raise a TestbedError. ``forget`` is
-    called with the step of a new checkpoint; ``keep`` before, with the checkpoint, by who writes a journal: it says
-    whether that is done, and is asked again. ``missed``: called with a role that the run goes on without.
+    called with the step of a new checkpoint. ``keep`` is given, before, what may become one, by who writes a journal;
+    ``stable`` says up to which step that is done. ``missed``: called with a role that the run goes on without.
     """
 
     def __init__(
@@ -70,12 +73,16 @@ class Recovery:
         self.launch: Callable[[RoleSpec], None] = _nobody
         self.missed: Callable[[str, int], None] = lambda role, last: None
         self.forget: Callable[[int], None] = lambda step: None
-        self.keep: Callable[[Checkpoint], bool] = lambda checkpoint: True
+        self.keep: Callable[[Checkpoint], None] = lambda checkpoint: None
+        self.stable: Callable[[], float] = lambda: inf
+        self.changes: Callable[[str], list[bytes]] = lambda role: []
+        """The changes that a role was told of."""
         self.happened: list[Recovered] = []
         self.down: dict[str, _Down] = {}
         self.checkpoint = Checkpoint(0)
         self._coming: dict[int, Checkpoint] = {}
         self._origins: dict[str, _Origin] = {}
+        self._served: dict[str, list[Order]] = {}
         self._restarts: Counter[str] = Counter()
         self.rejected: Counter[str] = Counter()
         self._blocks = [lane for lane, _ in setup.blocks]
@@ -98,7 +105,7 @@ class Recovery:
             self.happened.append(Recovered(role=role, how=how, step=step, policy="continue", begin=last))
             self.missed(role, last)
             return True
-        if policy == "fail" or self._restarts[role] >= allowed:
+        if policy == "fail" or not self._may_begin(role) or self._restarts[role] >= allowed:
             return False
         self._restarts[role] += 1
         for coming in self._coming.values():  # what the new process has not done itself must not be forgotten
@@ -121,6 +128,11 @@ class Recovery:
             place = self.happened.index(down.record)
             self.happened[place] = down.record.model_copy(update={"down_ms": waited})
 
+    def _may_begin(self, role: str) -> bool:
+        """Whether it is known from where a role would begin."""
+        joined = role_name(role) != role
+        return not joined or role in self._origins or role in self.checkpoint.states
+
     def reason(self, role: str) -> str:
         """Why a role that is lost ends the run, to be said behind how it was lost; nothing where that is plain."""
         times = self._restarts[role]
@@ -128,22 +140,29 @@ class Recovery:
 
     def begin(self, role: str, *, late: bool) -> Begin:
         """Where a role begins now."""
-        states, life = self.checkpoint.states.get(role), self._restarts[role]
+        states, life, changes = self.checkpoint.states.get(role), self._restarts[role], tuple(self.changes(role))
+        served = tuple((order, b"") for order in self._served.get(role, ()) if order.step >= self.checkpoint.step)
         if states is not None:
-            return Begin(self.checkpoint.step, late, states, life=life)
+            return Begin(self.checkpoint.step, late, states, served, changes, life)
         origin = self._origins.get(role)
         if origin is not None:
-            return Begin(origin.step, late, orders=tuple(origin.orders), life=life)
-        return Begin(0, late, life=life)
+            return Begin(origin.step, late, orders=(*origin.orders, *served), changes=changes, life=life)
+        return Begin(0, late, orders=served, changes=changes, life=life)
 
-    def joined(self, role: RoleSpec, step: int, orders: list[tuple[Order, bytes]], policy: Policy) -> None:
+    def taken(self, role: RoleSpec, spec: EstimatorSpec, step: int, orders: list[tuple[Order, bytes]]) -> None:
         """An estimator's service begins after a step, as it was told."""
-        self.specs[role.name], self._origins[role.name] = role, _Origin(step, orders)
-        self.policies[role.name] = policy
+        self._origins[role.name] = _Origin(step, orders)
+        self.joined(role, spec)
 
-    def told(self, role: str, order: Order) -> None:
+    def joined(self, role: RoleSpec, spec: EstimatorSpec) -> None:
+        """An estimator's service is part of the run from now on."""
+        self.specs[role.name] = role
+        if self.policies:
+            self.policies[role.name] = policy_of_service(self._setup.scenario, role.name, spec)
+
+    def served(self, role: str, order: Order) -> None:
         """A service was told something on its way that it is to be told again."""
-        self._origins.setdefault(role, _Origin(0, [])).orders.append((order, b""))
+        self._served.setdefault(role, []).append(order)
 
     def take(self, role: str, payload: bytes) -> None:
         """States that a role has given."""
@@ -167,11 +186,13 @@ class Recovery:
         whole = [step for step in self._coming if self._whole(step)]
         if not whole:
             return
-        newest = self._coming[max(whole)]
-        if self.keep(newest):
-            self.checkpoint = newest
-            self._coming = {step: coming for step, coming in self._coming.items() if step > newest.step}
-            self.forget(newest.step)
+        self.keep(self._coming[max(whole)])
+        stable = self.stable()
+        kept = max((step for step in whole if step <= stable), default=None)
+        if kept is not None:
+            self.checkpoint = self._coming[kept]
+            self._coming = {step: coming for step, coming in self._coming.items() if step > kept}
+            self.forget(kept)
 
     def _whole(self, step: int) -> bool:
         states = self._coming[step].states

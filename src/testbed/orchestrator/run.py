@@ -6,10 +6,11 @@ import gc
 import os
 import secrets
 import shlex
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,23 +19,29 @@ import numpy as np
 from testbed.channel.real.check import check_links
 from testbed.errors import RunFailed, TestbedError, UsageError, did_you_mean
 from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.desk import Desk
 from testbed.orchestrator.interrupts import Interrupts, noted
+from testbed.orchestrator.journal import Journal
+from testbed.orchestrator.keeping import Keeper
 from testbed.orchestrator.lanes_file import NAME as LANES
 from testbed.orchestrator.lanes_file import LaneFigures, write_lanes
-from testbed.orchestrator.outcome import summarise
+from testbed.orchestrator.outcome import summarise, versions
 from testbed.orchestrator.policies import policies_of
 from testbed.orchestrator.preflight import check_parts, check_processes, prepare_folder
 from testbed.orchestrator.priority import Priorities
+from testbed.orchestrator.processes import OneProcess, OwnProcesses
 from testbed.orchestrator.recorder import Recorder
+from testbed.orchestrator.resuming import FOLDER, Resumed, go_on, resumed, roles_at, services_at
 from testbed.orchestrator.roles import RoleSpec, roles_of
 from testbed.orchestrator.running import published
 from testbed.orchestrator.statistics import Progress
 from testbed.orchestrator.summary import Summary, Timing, write_summary
 from testbed.orchestrator.supervise import Supervisor, command_of
+from testbed.orchestrator.timeline import SNAPSHOTS
 from testbed.scenario import Scenario, to_toml
 from testbed.scenario.recovery import Policy
 from testbed.wire.begin import Begin
-from testbed.wire.memory_bus import MemoryNetwork
+from testbed.wire.memory_bus import MemoryBus, MemoryNetwork
 from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.process import settle_memory
 from testbed.wire.setup import Role, Setup
@@ -58,18 +65,47 @@ class Run:
     """
 
     def __init__(
-        self, scenario: Scenario, out: Path, *, progress: Progress = _no_progress, say: Callable[[str], None] = _silent
+        self,
+        scenario: Scenario,
+        out: Path,
+        *,
+        progress: Progress = _no_progress,
+        say: Callable[[str], None] = _silent,
+        begun: Resumed | None = None,
     ) -> None:
-        """Raises UsageError where the scenario cannot run or the folder cannot be written, before anything starts."""
+        """begun: what is known of the run, where it goes on; ``scenario`` is then that of ``begun``.
+
+        Raises UsageError where the scenario cannot run or the folder cannot be written, before anything starts.
+        """
         check_parts(scenario)
         check_links(scenario)
         prepare_folder(out)
         self._out, self._progress, self._say = out, progress, say
-        self._setup = Setup(secrets.token_hex(6), scenario)
-        self._roles = roles_of(scenario)
+        self._begun = begun
+        self._setup = Setup(secrets.token_hex(6) if begun is None else begun.run, scenario)
+        self._roles = roles_of(scenario) if begun is None else roles_at(roles_of(scenario), begun)
+        self._keeper: Keeper | None = None
         self._begun_s = time.monotonic()
         self._started_s: float | None = None
-        self._reported = 0
+        self._reported, self._complete = 0, False
+        self.desk = Desk()
+
+    @classmethod
+    def again(
+        cls, out: Path, *, progress: Progress = _no_progress, say: Callable[[str], None] = _silent
+    ) -> tuple[Run, Resumed]:
+        """The run of a folder that was not finished, and what is known of it. Raises UsageError where there is none."""
+        begun = resumed(out)
+        return cls(begun.scenario, out, progress=progress, say=say, begun=begun), begun
+
+    def shown_by(self, progress: Progress, say: Callable[[str], None]) -> None:
+        """As in the constructor."""
+        self._progress, self._say = progress, say
+
+    @property
+    def scenario(self) -> Scenario:
+        """As it was given."""
+        return self._setup.scenario if self._begun is None else self._begun.given
 
     @np.errstate(all="ignore")  # what is not finite has no figure, and is counted
     def over_zenoh(self, external: Sequence[str] = ()) -> Summary:
@@ -86,7 +122,7 @@ class Run:
                 raise UsageError(
                     f"--external {name}: no such role; allowed: {', '.join(names)}{did_you_mean(name, names)}"
                 )
-        policies = policies_of(self._setup.scenario, self._roles, external)
+        policies = self._policies(external)
         transport = self._setup.transport
         session, endpoint = open_router(transport)
         supervisor = Supervisor(self._out / "logs")
@@ -96,11 +132,13 @@ class Run:
             cleanup.enter_context(closing(session))
             if recorder is not None:
                 cleanup.callback(recorder.close)
+            journal = cleanup.enter_context(self._journal())
             cleanup.callback(supervisor.close, 0.0)
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.express)
             bus.timed = self._setup.real
+            self.desk.wake = lambda: bus.call(self.desk.work)
             cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
-            conductor = self._conductor(bus, recorder, policies)
+            conductor = self._conductor(bus, recorder, policies, journal)
 
             def launch(role: RoleSpec) -> None:
                 if role.name in external:
@@ -111,6 +149,7 @@ class Run:
             conductor.services.launch = conductor.recovery.launch = launch
             conductor.services.drop, conductor.ending = supervisor.end, supervisor.ending_of
             conductor.watchdog.stopped = supervisor.stopped
+            conductor.timeline.processes = OwnProcesses(supervisor, bus, conductor.restart)
             bus.subscribe(conductor.node.keys.warm("*"), lambda _key, _payload: None)
             importing = threading.Thread(target=_import_report, daemon=True)
             importing.start()
@@ -136,10 +175,18 @@ class Run:
         """
         check_processes(self._setup.scenario)
         self._setup = replace(self._setup, single=True)
-        policies = policies_of(self._setup.scenario, self._roles) if self._setup.snapshot_every else {}
+        policies = self._policies() if self._setup.snapshot_every else {}
         network = MemoryNetwork(schedule, timed=self._setup.real)
         recorder = self._recorder()
-        conductor = self._conductor(network.bus(), recorder, policies)
+        with ExitStack() as files:
+            if recorder is not None:
+                files.callback(recorder.close)
+            return self._in_process(network, recorder, policies, files.enter_context(self._journal()))
+
+    def _in_process(
+        self, network: MemoryNetwork, recorder: Recorder | None, policies: dict[str, Policy], journal: Journal | None
+    ) -> Summary:
+        conductor = self._conductor(network.bus(), recorder, policies, journal)
         nodes: list[tuple[Node, Role]] = []
 
         def join(spec: RoleSpec) -> None:
@@ -167,18 +214,31 @@ class Run:
 
         conductor.services.launch = conductor.recovery.launch = launch
         conductor.services.drop = drop
+
+        def bus_of(role: str) -> MemoryBus:
+            for node, _ in nodes:
+                if node.name == role:
+                    assert isinstance(node.bus, MemoryBus)
+                    return node.bus
+            raise UsageError(f"{role}: no role of this run")
+
+        conductor.timeline.processes = OneProcess(bus_of, conductor.restart)
         with ExitStack() as cleanup:
             interrupts = cleanup.enter_context(noted())
             cleanup.enter_context(self._raised(conductor, dict))
-            if recorder is not None:
-                cleanup.callback(recorder.close)
             try:
                 for spec in self._roles:
                     join(spec)
                 while not conductor.over and not interrupts.asked and not conductor.stop_asked:
+                    self.desk.work()
                     if not network.step():
-                        conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
+                        if conductor.resting:
+                            self.desk.wait(_POLL_S)
+                        else:
+                            conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
                     self._tell(conductor)
+                    if self._keeper is not None:
+                        self._keeper.tick()
             except TestbedError as error:
                 conductor.fail(str(error))
             conductor.stop()
@@ -188,9 +248,22 @@ class Run:
             _drain(network, lambda: conductor.all_reported)
             return self._finish(conductor, interrupted=interrupts.asked)
 
-    def _conductor(self, bus: object, recorder: Recorder | None, policies: dict[str, Policy]) -> Conductor:
-        conductor = Conductor(bus, self._setup, self._roles, recorder, policies)  # type: ignore[arg-type]
+    def _policies(self, external: Sequence[str] = ()) -> dict[str, Policy]:
+        services = {} if self._begun is None else services_at(self._begun)
+        return policies_of(self._setup.scenario, self._roles, external, services)
+
+    def _conductor(
+        self, bus: object, recorder: Recorder | None, policies: dict[str, Policy], journal: Journal | None
+    ) -> Conductor:
+        begin = 0 if self._begun is None else self._begun.step
+        conductor = Conductor(bus, self._setup, self._roles, recorder, policies, begin)  # type: ignore[arg-type]
         conductor.on_started, conductor.say = self._mark_start, self._say
+        if self._begun is not None:
+            go_on(conductor, self._begun)
+        if journal is not None:
+            self._keeper = Keeper(journal, conductor, recorder, len(self.scenario.events))
+        conductor.timeline.folder = self._out / SNAPSHOTS
+        self.desk.open(conductor)
         return conductor
 
     def _mark_start(self) -> None:
@@ -221,8 +294,32 @@ class Run:
         if scenario.record == "none":
             path.unlink(missing_ok=True)
             return None
-        metadata = {"name": scenario.name, "scenario": to_toml(scenario)}
-        return Recorder(path, lanes=self._setup.tap, period_ns=scenario.clock.period_ns, metadata=metadata)
+        metadata = {"name": scenario.name, "scenario": to_toml(self.scenario)}
+        done = None if self._begun is None or not self._begun.step else self._begun.step
+        return Recorder(
+            path, lanes=self._setup.tap, period_ns=scenario.clock.period_ns, metadata=metadata, resumed=done
+        )
+
+    @contextmanager
+    def _journal(self) -> Iterator[Journal | None]:
+        """What lets the run be finished should this process die; it is removed when the run is complete."""
+        wanted, folder = self._setup.scenario.recovery.journal, self._out / FOLDER
+        if wanted is False or (wanted is None and self._setup.single) or self._setup.real:
+            shutil.rmtree(folder, ignore_errors=True)
+            yield None
+            return
+        journal = Journal(folder)
+        if self._begun is None:
+            journal.begin({"run": self._setup.run, "scenario": to_toml(self.scenario), "versions": versions()})
+        else:
+            journal.go_on(self._begun.step)
+        try:
+            yield journal
+        finally:
+            with suppress(RunFailed):  # told before, or of no consequence any more
+                journal.close()
+            if self._complete:
+                shutil.rmtree(folder, ignore_errors=True)
 
     def _by_hand(self, role: RoleSpec, endpoint: str) -> list[str]:
         return command_of(role, endpoint, self._setup.run, self._setup.transport)
@@ -239,10 +336,12 @@ class Run:
             if now - looked < _POLL_S:
                 continue
             looked = now
+            self.desk.work()
             self._tell(conductor)
             for role, ending in supervisor.dead().items():
                 conductor.ended(role, f"{ending}{_last_words(supervisor.log_of(role))}")
             conductor.tick(deadline_s)
+            self._keep(conductor)
             if conductor.activity != last:
                 last, since = conductor.activity, now
             elif now - since > deadline_s and not (patient and not conductor.started):
@@ -252,6 +351,13 @@ class Run:
             role = conductor.failure.removesuffix(" is gone")
             if (how := supervisor.ending_of(role)) is not None:
                 conductor.failure = f"{role} ended: {how}{_last_words(supervisor.log_of(role))}"
+
+    def _keep(self, conductor: Conductor) -> None:
+        if self._keeper is not None:
+            try:
+                self._keeper.tick()
+            except RunFailed as error:
+                conductor.fail(str(error))
 
     def _settle(self, conductor: Conductor, bus: object) -> None:
         """Stop the roles and hear their last words."""
@@ -279,12 +385,12 @@ class Run:
             steps_per_s=completed / wall if wall > 0 else None,
             lane_steps_per_s=completed * lanes / wall if wall > 0 else None,
             window=self._setup.window,
-            swaps=tuple(conductor.services.downtimes),
+            swaps=conductor.services.swaps(),
         )
-        conductor.services.give_up()
+        conductor.timeline.give_up()
         if conductor.stop_asked and not conductor.collector.finished:
             status = "interrupted"
-            reason: str | None = "stopped by command"
+            reason: str | None = conductor.stop_asked
         elif interrupted and not conductor.collector.finished:
             status, reason = "interrupted", "interrupted by the user"
         elif conductor.failure is not None:
@@ -292,7 +398,8 @@ class Run:
         else:
             status, reason = "complete", None
         summary = summarise(conductor, status=status, reason=reason, timing=timing)
-        write_results(self._out, summary, self._setup.scenario, conductor.collector.by_lane())
+        write_results(self._out, summary, self.scenario, conductor.collector.by_lane())
+        self._complete = status == "complete"
         return summary
 
 

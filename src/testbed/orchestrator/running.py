@@ -79,8 +79,8 @@ def asking(out: Path, patience_s: float = 10.0) -> Iterator[Ask]:
         yield put
 
 
-def outcome_of(out: Path, put: Ask, number: int) -> Happened:
-    """What became of a change of estimators that was asked for; waits for it.
+def outcome_of(out: Path, put: Ask, number: int) -> list[Happened]:
+    """What became of an event that was asked for; waits for it. That of ACKs may be several changes.
 
     Raises UsageError where the run ends without a word of it.
     """
@@ -93,9 +93,8 @@ def outcome_of(out: Path, put: Ask, number: int) -> Happened:
                 raise
             found = list(read_summary(out / "summary.json").events)
             status = {"pending": []}
-        for event in found:
-            if event.number == number:
-                return event
         if number not in status["pending"]:
+            if events := [event for event in found if event.number == number]:
+                return events
             raise UsageError(f"{out}: its run ended before")
         time.sleep(_POLL_S)

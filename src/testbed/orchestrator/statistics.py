@@ -162,6 +162,13 @@ class Series:
             return dict(zip(self.names, row, strict=True))
         return [(int(n), mean if n else None, stderr if n > 1 else None) for n, mean, stderr in row]
 
+    def mean_at(self, step: int) -> dict[str, float | None] | None:
+        """Of each figure at one closed step; None where there are no figures."""
+        closed = self._closed[step - 1]
+        return (
+            None if closed is None else {n: mean for n, (_, mean, _) in zip(self.names, self._row(closed), strict=True)}
+        )
+
     @property
     def mean(self) -> dict[str, list[float | None]]:
         """Of each figure, along the closed steps; None where it has no value."""

@@ -187,21 +187,53 @@ class Transient(_Model):
     )
 
 
+Action = Literal[
+    "set",
+    "swap",
+    "add",
+    "shadow",
+    "remove",
+    "acks",
+    "partition",
+    "heal",
+    "input",
+    "plant",
+    "mark",
+    "snapshot",
+    "kill",
+    "pause",
+    "restart",
+]
+
+
 class Happened(_Model):
     """An event, and the step at which it took effect."""
 
     step: NonNegativeInt
-    by: Literal["timeline", "command"] = Field(description="whether the scenario or somebody outside asked for it")
-    action: Literal["set", "swap", "add", "shadow", "remove"] = Field(default="set", description="what happened")
+    by: Literal["timeline", "command", "condition"] = Field(
+        description="what brought it: a step or time in the scenario, somebody outside, or a condition that held"
+    )
+    action: Action = Field(default="set", description="what happened")
+    number: NonNegativeInt | None = Field(
+        default=None, description="number among the events, from 0: those of the scenario as written, then commands"
+    )
+    when: str | None = Field(default=None, description="the condition for which it waited")
+    true_at: NonNegativeInt | None = Field(default=None, description="step at which the condition began to hold")
     link: str | None = Field(default=None, description="which link")
     set: dict[str, Any] | None = Field(default=None, description="keys of the link that changed")
-    number: NonNegativeInt | None = Field(default=None, description="number among the changes of estimators, from 0")
+    links: tuple[str, ...] | None = Field(default=None, description="which links were cut or healed")
     estimator: str | None = Field(default=None, description="which estimator")
-    name: str | None = Field(default=None, description="name of the shadow")
+    name: str | None = Field(default=None, description="name of the shadow, or what the mark says")
     to: dict[str, Any] | str | None = Field(
         default=None, description="the new service: its table, or the name under which it ran"
     )
     handover: Literal["cold", "moments", "full"] | None = Field(default=None, description="what it started from")
+    acks: str | None = Field(default=None, description="what it is told of the control packets from then on")
+    input: dict[str, Any] | None = Field(default=None, description="the new input")
+    plant: dict[str, Any] | None = Field(default=None, description="the new parameters, and over how many steps")
+    role: str | None = Field(default=None, description="which process")
+    lasts: str | None = Field(default=None, description="for how long it stood still")
+    file: str | None = Field(default=None, description="where the snapshot is, in the folder of the run")
     ok: bool = Field(default=True, description="whether it was done; if not, all stayed as it was")
     reason: str | None = Field(default=None, description="why it was not done")
     bytes: NonNegativeInt | None = Field(default=None, description="size of the snapshots that were handed over")
@@ -210,23 +242,68 @@ class Happened(_Model):
     @property
     def text(self) -> str:
         """In words."""
-        if self.action == "set":
-            return f"link {self.link} changed"
+        text = self._what()
+        return text if self.ok else f"{text}: not done: {self.reason}"
+
+    @property
+    def label(self) -> str:
+        """In few words, for a figure."""
+        if self.action == "mark":
+            return self.name or ""
+        return f"{self.action} {self.link or self.estimator or self.role or ''}".strip()
+
+    @property
+    def origin(self) -> str:
+        """Who asked for it, in words."""
+        if self.when is None:
+            return self.by
+        since = "" if self.true_at is None else f", true at step {self.true_at}"
+        return f"{self.when}{since}"
+
+    def _what(self) -> str:
+        match self.action:
+            case "set":
+                return f"link {self.link} changed"
+            case "partition" | "heal":
+                return f"{self.action} of {', '.join(self.links) if self.links else 'all links'}"
+            case "mark":
+                return f"mark: {self.name}"
+            case "input":
+                return f"input: {(self.input or {}).get('kind')}"
+            case "plant":
+                plant = dict(self.plant or {})
+                over = plant.pop("over", 1)
+                return f"plant: {', '.join(plant)} changed" + (f" over {over} steps" if over > 1 else "")
+            case "snapshot":
+                return f"snapshot of {self.estimator}"
+            case "acks":
+                return f"ACKs of {self.estimator or 'all'}: {self.acks}"
+            case "kill" | "restart":
+                return f"{self.action} {self.role}"
+            case "pause":
+                return f"pause {self.role} for {self.lasts}"
         what = f"{self.action} {self.estimator}"
         if isinstance(self.to, str):
-            what += f" to {self.to}"
-        elif self.to is not None:
+            return f"{what} to {self.to}"
+        if self.to is not None:
             what += f" to {self.to['kind']}" + (f", {self.handover}" if self.handover is not None else "")
-        return what if self.ok else f"{what}: not done: {self.reason}"
+        return what
 
 
 class Downtime(_Model):
-    """How long the clock stood still for a change of estimators; no step was left out."""
+    """What a change of estimators cost in time; no step was left out."""
 
     step: NonNegativeInt
     estimator: str
     steps: NonNegativeInt = Field(default=0, description="steps without an estimate of it")
-    ms: Number = Field(description="on the wall clock, from the last estimate before to the clock that goes on")
+    ms: Number = Field(description="how long the clock stood still, on the wall clock; never in real time")
+    late_ms: Number = Field(
+        default=None,
+        description="in real time: the largest time from t_k to publication of the first ten estimates from there on",
+    )
+    missed: NonNegativeInt | None = Field(
+        default=None, description="in real time: how many of those ten missed their deadline"
+    )
 
 
 class Recovered(_Model):

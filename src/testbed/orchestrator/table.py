@@ -31,8 +31,8 @@ def end_table(summary: Summary, directory: Path) -> RenderableType:
     if summary.realtime is not None:
         parts += _realtime(summary.realtime)
     for event in summary.events:
-        if event.action != "set":
-            parts.append(_line(f"step {event.step}", event.text, "dim" if event.ok else "bold yellow"))
+        origin = "" if event.by == "timeline" else f" ({event.origin})"
+        parts.append(_line(f"step {event.step}", f"{event.text}{origin}", "dim" if event.ok else "bold yellow"))
     parts += [_line(f"step {lost.step}", lost.text, "bold yellow") for lost in summary.recovered]
     parts += [_line("not ok", f"{check.name}: {check.text}", "bold yellow") for check in summary.checks if not check.ok]
     for role, reasons in summary.rejected.items():

@@ -2,6 +2,7 @@
 
 With model error A, G and C are A(ε_k), G(ε_k) and C(ε_k); ε_k is that of the step and the lane. An actuator that
 holds applies B a_k in place of ν_k B u_k, with a_k = ν_k u_k + (1 − ν_k) a_{k−1} and a_{−1} = 0.
+Where events let the plant drift, all of them are those of the step (`testbed.scenario.drift`).
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from testbed.numerics.stepping import Step, masked_step
 from testbed.numerics.streams import Stream
 from testbed.numerics.symbols import Shape
 from testbed.scenario import Scenario, System, Uncertainty
+from testbed.scenario.drift import moving, settles
+from testbed.scenario.plant_events import PlantEvent
 
 
 def root(covariance: Floats) -> Floats:
@@ -48,9 +51,10 @@ class Plant:
 
     def __init__(self, scenario: Scenario, lane: int, lanes: int) -> None:
         system = scenario.system
-        self._lanes, self._matrices = lanes, _matrices(scenario.system)
+        self._lanes, self._matrices = lanes, _matrices(system)
         self._advance = _stepper(self._matrices, lanes)
         uncertainty = scenario.uncertainty
+        self._nominal, self._uncertainty, self._moved_by = system, uncertainty, system
         self._derivatives, self._delta = _derivatives(system, uncertainty), 0.0
 
         def stream(purpose: str, width: int) -> Stream:
@@ -70,6 +74,33 @@ class Plant:
             self._parameters = stream("uncertainty", uncertainty.parameters)
             self._epsilon = self._draw(0)
             self._advance_uncertain = _uncertain_stepper(self._matrices, self._derivatives, lanes)
+        self._drift: list[tuple[int, PlantEvent]] = []
+        self._compiled, self._settles = True, 0
+        for step, event in scenario.drift:
+            self.change(step, event)
+
+    def change(self, step: int, event: PlantEvent) -> None:
+        """Let parameters change from a step on that is still to come."""
+        self._drift = sorted([*self._drift, (step, event)], key=lambda entry: entry[0])
+        self._settles, self._compiled = settles(self._drift), False
+
+    def _parameters_now(self) -> None:
+        """Those of this move; straight-line code is made once they have come to rest."""
+        system = moving(self._nominal, self._drift, self._k)
+        if system == self._moved_by and self._compiled:
+            return
+        self._moved_by, self._compiled = system, self._k >= self._settles or system == self._nominal
+        self._matrices = _matrices(system)
+        if self._derivatives is None:
+            made = _stepper(self._matrices, self._lanes) if self._compiled else partial(_advance, self._matrices)
+            self._advance = made
+            return
+        self._derivatives = _derivatives(system, self._uncertainty)
+        assert self._derivatives is not None
+        if self._compiled:
+            self._advance_uncertain = _uncertain_stepper(self._matrices, self._derivatives, self._lanes)
+        else:
+            self._advance_uncertain = partial(_advance_uncertain, self._matrices, self._derivatives)
 
     def _draw(self, k: int) -> Vector:
         """ε_k."""
@@ -90,6 +121,8 @@ class Plant:
 
         Returns x_{k+1} (M, n) and y_{k+1} (M, p).
         """
+        if self._drift and (self._k <= self._settles or not self._compiled):
+            self._parameters_now()
         control = [0.0] * self._matrices.q if u is None else vector_of(u)
         if self._held is not None:
             self._held = control = where_vector(applied, control, self._held)

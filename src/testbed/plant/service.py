@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from testbed.errors import RunFailed
 from testbed.numerics.lanes import mask_of
 from testbed.plant.dynamics import Plant, bits
+from testbed.scenario.plant_events import PlantEvent
 from testbed.wire.codec import all_finite
-from testbed.wire.messages import Acknowledgement, Control, Observation, Truth
-from testbed.wire.node import Node
+from testbed.wire.messages import Acknowledgement, Change, Control, Observation, Truth
+from testbed.wire.node import ORCHESTRATOR, Node
 from testbed.wire.setup import Setup
 from testbed.wire.state import pack, unpack
 
@@ -27,11 +28,18 @@ class PlantService:
         self._plants = {lane: Plant(setup.scenario, lane, lanes) for lane, lanes in setup.blocks}
         self._costs = setup.costs_input
         self._noise = setup.scenario.links.observation.on_loss == "noise"
-        self._truth = node.sender(keys.truth, Truth, lazy=True)
+        self._truth = node.sender(keys.truth, Truth, lazy=not setup.scenario.waits)
         self._ack = node.sender(keys.sent("ack"), Acknowledgement, tap=True) if setup.acks_are_of_use else None
         self._observe = node.sender(keys.sent("observation"), Observation, tap=True)
         self.counters: dict[str, int] = {}
         node.on(keys.delivered("control"), Control, "link.control", self._move, needs=("mask",))
+        node.on(keys.change(ROLE), Change, ORCHESTRATOR, self._change)
+
+    def _change(self, change: Change, _: dict[str, NDArray[Any]]) -> None:
+        """Take an order to drift from a step on that is still to come; the orchestrator has checked it."""
+        event = PlantEvent.model_validate(change.set)
+        for plant in self._plants.values():
+            plant.change(change.step, event)
 
     @property
     def gives_state(self) -> bool:

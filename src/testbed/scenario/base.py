@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 SHOWN_MAX = 60
@@ -26,7 +27,13 @@ class Part(BaseModel):
     @classmethod
     def known_keys(cls) -> list[str]:
         """The keys allowed in the table of this part."""
-        return [*cls.model_fields, *cls.other_keys]
+        return [*(field.alias or name for name, field in cls.model_fields.items()), *cls.other_keys]
+
+    @classmethod
+    def field_of(cls, key: str) -> FieldInfo | None:
+        """The field of a key of the table."""
+        fields = cls.model_fields
+        return fields.get(key) or next((field for field in fields.values() if field.alias == key), None)
 
 
 def problem(text: str, at: str = "") -> PydanticCustomError:
@@ -47,6 +54,14 @@ def shown(value: object) -> str:
     except (ValueError, RecursionError):  # an integer of thousands of digits, lists within lists within …
         return "a value too long to show"
     return text if len(text) <= SHOWN_MAX else text[: SHOWN_MAX - 2] + " …"
+
+
+def plain(tables: dict[str, Any]) -> dict[str, Any]:
+    """Tables with the numbers and arrays of numpy in them as Python's own."""
+    return {
+        key: plain(value) if isinstance(value, dict) else value.tolist() if hasattr(value, "tolist") else value
+        for key, value in tables.items()
+    }
 
 
 def count(amount: int, noun: str) -> str:

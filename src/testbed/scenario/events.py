@@ -1,24 +1,26 @@
-"""The timeline of a run: what happens at which step."""
+"""The timeline of a run: what happens at which step. Those of estimators and of the plant have files of their own."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag
+from pydantic import BeforeValidator, Field
 
-from testbed.scenario.base import COUNT_MAX, Part, problem, shown
-from testbed.scenario.durations import format_duration, parse_duration
-from testbed.scenario.estimators import Name, NewService
+from testbed.scenario.base import problem, shown
+from testbed.scenario.durations import Duration
+from testbed.scenario.estimator_events import (
+    AcksEvent,
+    AddEvent,
+    RemoveEvent,
+    ShadowEvent,
+    SwapEvent,
+)
+from testbed.scenario.estimators import Name
+from testbed.scenario.moments import AnyEvent
+from testbed.scenario.plant_events import InputEvent, PlantEvent
 
-HandOver = Literal["cold", "moments", "full"]
-
-
-def _moment(value: object) -> int | str:
-    if isinstance(value, str):
-        return format_duration(parse_duration(value, zero=True))
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= COUNT_MAX:
-        raise problem(f"got {shown(value)}; allowed: a step, 0 or more, or a duration such as '500 ms'")
-    return value
+LinkName = Literal["control", "observation", "ack"]
+LABEL_PATTERN = r"^[^\x00-\x1f\x7f]+$"
 
 
 def _table(value: object) -> dict[str, Any]:
@@ -27,90 +29,99 @@ def _table(value: object) -> dict[str, Any]:
     return value
 
 
-class _Event(Part):
-    at: Annotated[int | str, BeforeValidator(_moment)] = Field(
-        description="When: a step k, or a duration since the start; then the first step that is not earlier."
-    )
-
-    def step(self, period_ns: int) -> int:
-        """The first step at which it holds: for y_k and the ACK of step k, for u_k, and for the estimates of step k."""
-        return self.at if isinstance(self.at, int) else -(-parse_duration(self.at, zero=True) // period_ns)
-
-
-class LinkEvent(_Event):
+class LinkEvent(AnyEvent):
     """Some keys of a link get other values, for the packets sent at that step or later."""
 
     action: Literal["set"] = Field(description="Keys of a link get other values.")
-    link: Literal["control", "observation", "ack"] = Field(description="Which link.")
+    link: LinkName = Field(description="Which link.")
     set: Annotated[dict[str, Any], BeforeValidator(_table)] = Field(
         description="The keys of the link's table and their new values; 'none' removes a stage."
     )
 
 
-def _service(value: object) -> object:
-    if not isinstance(value, str | dict | NewService):
-        raise problem(
-            f"got {shown(value)}; allowed: a table with the kind of the new estimator, or the name of one that runs"
-        )
-    return value
+def _which(value: object) -> object:
+    names = get_args(LinkName)
+    if not isinstance(value, list | tuple) or not value or any(entry not in names for entry in value):
+        raise problem(f"got {shown(value)}; allowed: a list of {', '.join(names)}; left out: all")
+    if len(set(value)) < len(value):
+        raise problem(f"got {shown(value)}; allowed: each link once")
+    return tuple(value)
 
 
-def _form(value: object) -> str:
-    return "name" if isinstance(value, str) else "table"
+_Links = Annotated[tuple[LinkName, ...], BeforeValidator(_which)]
 
 
-Successor = Annotated[
-    Annotated[NewService, Tag("table")] | Annotated[Name, Tag("name")],
-    Discriminator(_form),
-    BeforeValidator(_service),
-]
+class PartitionEvent(AnyEvent):
+    """Nothing gets through some links, until they are healed."""
+
+    action: Literal["partition"] = Field(description="Links are cut.")
+    links: _Links | None = Field(default=None, description="Which links; left out: all of the run.")
 
 
-class SwapEvent(_Event):
-    """Another service gives the estimates of a name from that step on."""
+class HealEvent(AnyEvent):
+    """Links that were cut carry packets again; their losses go on as if they had not been cut."""
 
-    action: Literal["swap"] = Field(description="Another service takes over an estimator.")
-    estimator: Name = Field(description="The name whose estimates it gives from then on.")
-    to: Successor = Field(
-        description="The new estimator as a table with its kind, or the name of one that runs, such as a shadow."
-    )
-    handover: HandOver | None = Field(
-        default=None,
-        description="What it starts from: the prior, the mean and covariance (if left out), or the whole state of the "
-        "old one. Not with the name of one that runs.",
-    )
+    action: Literal["heal"] = Field(description="Links are whole again.")
+    links: _Links | None = Field(default=None, description="Which links; left out: all that are cut.")
 
 
-class AddEvent(_Event):
-    """A further estimator from that step on; it knows the prior and no more."""
+class MarkEvent(AnyEvent):
+    """A mark in the results; it changes nothing."""
 
-    action: Literal["add"] = Field(description="A further estimator.")
-    estimator: Name = Field(description="Its name in the results; one of its own.")
-    to: NewService = Field(description="What it is: a table with its kind.")
+    action: Literal["mark"] = Field(description="A mark in the results.")
+    name: str = Field(min_length=1, max_length=64, pattern=LABEL_PATTERN, description="What it says, on one line.")
 
 
-class ShadowEvent(_Event):
-    """An estimator beside one that runs, with its knowledge, under a name of its own; a swap may promote it."""
+class SnapshotEvent(AnyEvent):
+    """The whole state of an estimator goes into a file of the run: the one from which that step goes on."""
 
-    action: Literal["shadow"] = Field(description="An estimator beside one that runs.")
-    estimator: Name = Field(description="The one beside which it runs.")
-    name: Name = Field(description="Its name in the results; one of its own.")
-    to: NewService = Field(description="What it is: a table with its kind.")
-    handover: HandOver | None = Field(
-        default=None, description="What it starts from, as in a swap; the other one goes on."
+    action: Literal["snapshot"] = Field(description="The state of an estimator is written down.")
+    estimator: Name = Field(description="Which estimator.")
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")] | None = Field(
+        default=None, description="The file is snapshots/NAME-STEP.bin; left out: the name of the estimator."
     )
 
 
-class RemoveEvent(_Event):
-    """An estimator leaves; the step before is its last."""
+class KillEvent(AnyEvent):
+    """A process is killed before that step, with all estimates before it there."""
 
-    action: Literal["remove"] = Field(description="An estimator leaves.")
-    estimator: Name = Field(description="Which one.")
+    action: Literal["kill"] = Field(description="A process is killed.")
+    role: str = Field(description="Its role, such as 'plant', 'link.control' or 'estimator.aoe'.")
 
 
-EstimatorEvent = SwapEvent | AddEvent | ShadowEvent | RemoveEvent
-ESTIMATOR_EVENTS: tuple[type[EstimatorEvent], ...] = get_args(EstimatorEvent)
+class PauseEvent(AnyEvent):
+    """A process stands still for a while on the wall clock."""
+
+    action: Literal["pause"] = Field(description="A process is stopped and continued.")
+    role: str = Field(description="Its role, such as 'plant', 'link.control' or 'estimator.aoe'.")
+    lasts: Duration = Field(alias="for", description="How long.")
+
+
+class RestartEvent(AnyEvent):
+    """A process is ended and started anew."""
+
+    action: Literal["restart"] = Field(description="A process is ended and started anew.")
+    role: str = Field(description="Its role, such as 'plant', 'link.control' or 'estimator.aoe'.")
+
+
+CutEvent = PartitionEvent | HealEvent
+ProcessEvent = KillEvent | PauseEvent | RestartEvent
+PROCESS_EVENTS: tuple[type[ProcessEvent], ...] = get_args(ProcessEvent)
 Event = Annotated[
-    LinkEvent | SwapEvent | AddEvent | ShadowEvent | RemoveEvent,
+    LinkEvent
+    | SwapEvent
+    | AddEvent
+    | ShadowEvent
+    | RemoveEvent
+    | AcksEvent
+    | PartitionEvent
+    | HealEvent
+    | InputEvent
+    | PlantEvent
+    | MarkEvent
+    | SnapshotEvent
+    | KillEvent
+    | PauseEvent
+    | RestartEvent,
     Field(discriminator="action"),
 ]

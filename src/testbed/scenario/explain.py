@@ -75,7 +75,7 @@ def locate(loc: tuple[int | str, ...], whole: type[Part] = Scenario) -> Place:
             parent, key = path, step
             path = f"{path}.{step}" if path else step
             part = target if issubclass(target, Part) else None
-            field = target.model_fields.get(step)
+            field = target.field_of(step) if issubclass(target, Part) else target.model_fields.get(step)
             target = _target(field.annotation) if field else None
     return Place(path, parent, part, key, field, target)
 

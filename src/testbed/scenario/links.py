@@ -19,6 +19,11 @@ class Impairments(Part):
     """What happens to the packets of one direction of a link, in the order of the keys (see docs: links)."""
 
     loss: Loss = Field(default_factory=NoLoss, description="Which packets are lost; default none.")
+    up: bool = Field(
+        default=True,
+        description="Whether anything gets through; false only in changes of a run, where a partition sets it. Draws "
+        "and chains go on meanwhile.",
+    )
     clock: Literal["packet", "time"] = Field(
         default="packet", description="What moves the chain of the losses: each packet, or time, once a slot."
     )
@@ -95,6 +100,11 @@ class SteppedImpairments(Impairments):
         return self
 
     @property
+    def backwards(self) -> Impairments:
+        """What happens to what a connection sends back."""
+        return self if self.back is None else self.back.model_copy(update={"up": self.up})
+
+    @property
     def takes_time(self) -> bool:
         """Whether a packet may arrive late, twice or spoilt, or meet a chain that is not moved by packets."""
         stages = (self.slot, self.rate, self.delay, self.reorder, self.duplicate, self.corrupt, self.transport)
@@ -157,6 +167,13 @@ class Links(Part):
     control: Link = Field(default_factory=Link, description="Controller to plant: u.")
     observation: ObservationLink = Field(default_factory=ObservationLink, description="Plant to estimators: y.")
     ack: AckLink = Field(default_factory=AckLink, description="Plant to estimators: which u were applied.")
+
+    @model_validator(mode="after")
+    def _up_at_first(self) -> "Links":
+        for name in type(self).model_fields:
+            if not getattr(self, name).up:
+                raise problem("got false; allowed: true, and an event 'partition' with at = 0", f"{name}.up")
+        return self
 
     def of_run(self, packets: int, period_ns: int) -> "Links":
         """For a run of so many packets a link: replayed losses with their law. A problem of validation if one ends."""

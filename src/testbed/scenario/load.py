@@ -1,21 +1,14 @@
-"""Reading a scenario: the file, the tables it refers to, and the errors of both."""
+"""Reading a scenario: the file, and its errors."""
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from testbed.errors import UsageError
-from testbed.scenario.base import shown
-from testbed.scenario.explain import explain
+from testbed.scenario.files import resolve_files
 from testbed.scenario.models import Scenario
-from testbed.scenario.presets import resolved
-from testbed.scenario.table import read_table, read_text
-from testbed.scenario.trace_file import read_fates
-
-_TLS_FILES = ("ca", "certificate", "key", "client_certificate", "client_key")
+from testbed.scenario.table import read_text
 
 
 def load_scenario(path: Path | str) -> Scenario:
@@ -39,9 +32,7 @@ def parse_scenario(
     """
     try:
         tables = _parse_toml(dict_or_text) if isinstance(dict_or_text, str) else dict(dict_or_text)
-        return Scenario.model_validate(_resolve_files(tables, Path(base_dir)))
-    except ValidationError as error:
-        raise _error(source, explain(error)) from None
+        return Scenario(**resolve_files(tables, Path(base_dir)))
     except UsageError as error:
         raise _error(source, error) from None
     except RecursionError:
@@ -59,95 +50,3 @@ def _parse_toml(text: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except ValueError as error:  # of the syntax, or an integer of thousands of digits
         raise UsageError(f"not valid TOML: {error}") from None
-
-
-def _resolve_files(tables: dict[str, Any], base_dir: Path) -> dict[str, Any]:
-    """The tables with CSV files read in, and paths made absolute. What does not fit is left alone."""
-    result = dict(tables)
-    source = result.get("input")
-    if isinstance(source, dict) and source.get("kind") == "table":
-        result["input"] = _with_values("input", source, base_dir)
-    if isinstance(result.get("links"), dict):
-        result["links"] = {
-            name: _read_link(name, link, base_dir) if isinstance(link, dict) else link
-            for name, link in result["links"].items()
-        }
-    transport = result.get("transport")
-    if isinstance(transport, dict):
-        transport = _absolute(transport, ("users_file",), base_dir)
-        if isinstance(transport.get("tls"), dict):
-            transport["tls"] = _absolute(transport["tls"], _TLS_FILES, base_dir)
-        result["transport"] = transport
-    return result
-
-
-def _absolute(table: dict[str, Any], keys: tuple[str, ...], base_dir: Path) -> dict[str, Any]:
-    given = {key: table[key] for key in keys if isinstance(table.get(key), str) and table[key]}
-    return {**table, **{key: str((base_dir / path).absolute()) for key, path in given.items()}}
-
-
-def _read_link(name: str, table: dict[str, Any], base_dir: Path) -> dict[str, Any]:
-    try:
-        table = resolved(table, "down" if name == "control" else "up")
-    except UsageError as error:
-        raise UsageError(f"links.{name}.{error}") from None
-    return _read_trace(name, _read_delays(name, table, base_dir), base_dir)
-
-
-def _read_trace(link: str, table: dict[str, Any], base_dir: Path) -> dict[str, Any]:
-    loss = table.get("loss")
-    if not isinstance(loss, dict) or loss.get("kind") != "trace":
-        return table
-
-    def read(path: Path, name: str) -> str:
-        word = read_fates(path, name).word
-        if not word:
-            raise UsageError(f"{name}: no packets; allowed: a row for each packet")
-        return word
-
-    return {**table, "loss": _read_in(f"links.{link}.loss", loss, base_dir, "fates", read)}
-
-
-def _read_delays(link: str, table: dict[str, Any], base_dir: Path) -> dict[str, Any]:
-    delay = table.get("delay")
-    if not isinstance(delay, dict) or delay.get("kind") != "table":
-        return table
-    where = f"links.{link}.delay"
-    resolved = _with_values(where, delay, base_dir)
-    rows = resolved["values"]
-    if resolved is not delay:
-        if len(rows[0]) != 1:
-            raise UsageError(f"{where}.file: {delay['file']}: got {len(rows[0])} numbers a row; allowed: one")
-        resolved["values"] = [row[0] for row in rows]
-    return {**table, "delay": resolved}
-
-
-def _with_values(where: str, source: dict[str, Any], base_dir: Path) -> dict[str, Any]:
-    """The table with the rows of its ``file`` as its ``values``."""
-
-    def read(path: Path, name: str) -> list[list[float]]:
-        try:
-            return read_table(path)
-        except UsageError as error:
-            raise UsageError(f"{name}: {error}") from None
-
-    return _read_in(where, source, base_dir, "values", read)
-
-
-def _read_in(
-    where: str, source: dict[str, Any], base_dir: Path, key: str, read: Callable[[Path, str], Any]
-) -> dict[str, Any]:
-    """The table with what is in its ``file`` under ``key``."""
-    if ("file" in source) == (key in source):
-        given = "both" if "file" in source else "neither"
-        raise UsageError(f"{where}: got {given} of file and {key}; allowed: exactly one of file, {key}")
-    if "file" not in source:
-        return source
-    file = source["file"]
-    if not isinstance(file, str) or not file:
-        raise UsageError(f"{where}.file: got {shown(file)}; allowed: the path of a CSV file")
-    try:
-        content = read(base_dir / file, file)
-    except UsageError as error:
-        raise UsageError(f"{where}.file: {error}") from None
-    return {**{name: value for name, value in source.items() if name != "file"}, key: content}

@@ -1,26 +1,40 @@
 """The scenario as a whole."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
 from testbed.errors import UsageError, did_you_mean
 from testbed.scenario.actuator import Actuator
-from testbed.scenario.base import Count, Part, count, problem, shown
-from testbed.scenario.changes import in_turn
+from testbed.scenario.base import Count, Part, count, plain, problem, shown
+from testbed.scenario.changes import changed, in_turn
 from testbed.scenario.closed_loop import ClosedLoop, FeedbackInput, LqgInput, PidInput, PythonInput
 from testbed.scenario.cost import Cost
 from testbed.scenario.durations import format_duration, parse_duration
+from testbed.scenario.estimator_events import ESTIMATOR_EVENTS, EstimatorEvent
 from testbed.scenario.estimators import EstimatorSpec
-from testbed.scenario.events import ESTIMATOR_EVENTS, EstimatorEvent, Event, LinkEvent
+from testbed.scenario.event_checks import Surroundings, check_events
+from testbed.scenario.events import Event, HealEvent, LinkEvent, PartitionEvent
+from testbed.scenario.files import resolve_files
 from testbed.scenario.inputs import ConstantInput, Input, TableInput, check_channels
+from testbed.scenario.link_timeline import changes_in
 from testbed.scenario.links import AckLink, Links, SteppedImpairments
+from testbed.scenario.moments import AnyEvent
+from testbed.scenario.plant_events import PlantEvent
 from testbed.scenario.recovery import Recovery
 from testbed.scenario.services import Planned, planned
 from testbed.scenario.system import System
 from testbed.scenario.transport import Clock, Transport
 from testbed.scenario.uncertainty import Uncertainty
+
+if TYPE_CHECKING:
+    from testbed.orchestrator.live import LiveRun
+
+E = TypeVar("E", bound=AnyEvent)
 
 SEED_MAX = 2**63 - 1
 SLOTS_A_PERIOD = 1000
@@ -43,7 +57,10 @@ def _cost_of_input(data: dict[str, Any]) -> Cost | None:
 
 
 class Scenario(Part):
-    """Everything that determines a run: the same scenario and seed give the same results."""
+    """Everything that determines a run: the same scenario and seed give the same results.
+
+    In Python its tables are keywords, with values as in the file: ``Scenario(steps=50, system={"A": [[1.0]], …})``.
+    """
 
     name: str = Field(
         default="scenario",
@@ -77,6 +94,25 @@ class Scenario(Part):
     events: Annotated[tuple[Event, ...], Field(strict=False)] = Field(
         default=(), description="The timeline: what happens while the run goes."
     )
+
+    def __init__(self, /, **tables: Any) -> None:
+        """Relative paths are taken from the current folder. Raises UsageError, of one line."""
+        from testbed.scenario.explain import explain
+
+        try:
+            super().__init__(**resolve_files(plain(tables), Path()))
+        except ValidationError as error:
+            raise UsageError(explain(error)) from None
+
+    def start(self, out: str | PathLike[str] | None = None, *, in_process: bool = False) -> "LiveRun":
+        """Start a run of it that a script steers; results go into the folder ``out``, by default runs/NAME-TIME.
+
+        It waits at the beginning until the script lets it go: see ``testbed.orchestrator.live``, which is loaded here
+        by its name, as a scenario knows nothing of how it is run. ``in_process``: everything in this process, without
+        zenoh. Raises UsageError where the scenario cannot run, RunFailed where the roles do not start.
+        """
+        run: LiveRun = import_module("testbed.orchestrator.live").start(self, out, in_process=in_process)
+        return run
 
     @field_validator("uncertainty")
     @classmethod
@@ -119,16 +155,9 @@ class Scenario(Part):
     @field_validator("events")
     @classmethod
     def _check_events(cls, events: tuple[Event, ...], info: ValidationInfo) -> tuple[Event, ...]:
-        if {"links", "clock", "steps"} <= info.data.keys():
-            for i, event in enumerate(events):
-                if info.data["clock"].mode == "real" and not isinstance(event, LinkEvent):
-                    raise problem(
-                        f"got {event.action!r} with clock mode 'real', which does not wait for a new estimator; "
-                        "allowed there: set",
-                        f"[{i}].action",
-                    )
-                if isinstance(event, LinkEvent):
-                    _check_event(info.data["links"], events, i, info.data["clock"], info.data["steps"])
+        around = Surroundings.of(info.data)
+        if around is not None:
+            check_events(events, around)
         if {"estimators", "input", "clock", "steps"} <= info.data.keys():
             source: Input | None = info.data["input"]
             _planned(events, info.data["estimators"], source, info.data["clock"], info.data["steps"])
@@ -140,8 +169,23 @@ class Scenario(Part):
         return _planned(self.events, self.estimators, self.input, self.clock, self.steps)
 
     def changes_of(self, link: str) -> list[tuple[int, dict[str, Any]]]:
-        """(step, keys with their new values) of a link's events, in the order of time."""
-        return [(e.step(self.clock.period_ns), e.set) for e in _in_time(self.events, link, self.clock)]
+        """(step, keys with their new values) of a link's events whose step is known, in the order of time."""
+        return list(changes_in(self.links, self.timed(LinkEvent, PartitionEvent, HealEvent)).get(link, []))
+
+    def timed(self, *kinds: type[E]) -> list[tuple[int, E]]:
+        """The events of some kinds whose step is known, with it, in the order of time."""
+        found = [(e.step(self.clock.period_ns), e) for e in self.events if isinstance(e, kinds) and e.timed]
+        return sorted(found, key=lambda entry: entry[0])
+
+    @property
+    def drift(self) -> list[tuple[int, PlantEvent]]:
+        """The changes of the plant whose step is known, with it, in the order of time."""
+        return self.timed(PlantEvent)
+
+    @property
+    def waits(self) -> bool:
+        """Whether an event waits for a condition."""
+        return any(not event.timed for event in self.events)
 
     def variants(self, link: str) -> list[SteppedImpairments]:
         """The link of that name at the beginning, and after each of its events."""
@@ -159,7 +203,9 @@ class Scenario(Part):
         """Whether the link of that name takes time, at the beginning or after an event, or carries ACKs in batches."""
         settings = getattr(self.links, link)
         batched = isinstance(settings, AckLink) and settings.batch > 1
-        return batched or any(variant.takes_time for variant in self.variants(link))
+        waiting = [e.set for e in self.events if isinstance(e, LinkEvent) and e.link == link and not e.timed]
+        variants = [*self.variants(link), *(changed(settings, table) for table in waiting)]
+        return batched or any(variant.takes_time for variant in variants)
 
     @field_validator("input")
     @classmethod
@@ -209,35 +255,13 @@ def _planned(
 ) -> list[Planned]:
     """The events of estimators in the order of time; a problem of validation where one does not fit."""
     followed = source.estimator if isinstance(source, ClosedLoop) else None
-    places = [i for i, event in enumerate(events) if isinstance(event, ESTIMATOR_EVENTS)]
+    places = [i for i, event in enumerate(events) if isinstance(event, ESTIMATOR_EVENTS) and event.timed]
     timed: list[tuple[EstimatorEvent, int]] = []
     for i in places:
         event = events[i]
         assert isinstance(event, ESTIMATOR_EVENTS)
         timed.append((event, event.step(clock.period_ns)))
     return planned(specs, timed, steps=steps, followed=followed, places=places)
-
-
-def _check_event(links: Links, events: Sequence[Event], i: int, clock: Clock, steps: int) -> None:
-    """A problem of validation where an event does not fit the link as those before it have left it."""
-    event = events[i]
-    assert isinstance(event, LinkEvent)
-    if event.step(clock.period_ns) > steps:
-        raise problem(f"got {shown(event.at)}; allowed: at most {steps}, the steps of the scenario", f"[{i}].at")
-    if event.link == "ack" and links.ack.mode != "link":
-        raise problem(f"got 'ack' with mode {links.ack.mode!r}; allowed: only with mode 'link'", f"[{i}].link")
-    ordered = _in_time(events, event.link, clock)
-    until_now = ordered[: next(n for n, other in enumerate(ordered) if other is event) + 1]
-    try:
-        in_turn(getattr(links, event.link), [e.set for e in until_now])
-    except UsageError as error:
-        raise problem(str(error), f"[{i}].set") from None
-
-
-def _in_time(events: Sequence[Event], link: str, clock: Clock) -> list[LinkEvent]:
-    """The events of a link in the order of time; those of one step as they are written."""
-    of_link = [e for e in events if isinstance(e, LinkEvent) and e.link == link]
-    return sorted(of_link, key=lambda e: e.step(clock.period_ns))
 
 
 def _closed_loop(source: Following, info: ValidationInfo) -> Following:

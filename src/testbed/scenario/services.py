@@ -7,25 +7,41 @@ from dataclasses import dataclass, replace
 
 from testbed.errors import did_you_mean
 from testbed.scenario.base import problem, shown
+from testbed.scenario.estimator_events import (
+    AcksEvent,
+    AddEvent,
+    EstimatorEvent,
+    HandOver,
+    RemoveEvent,
+    ShadowEvent,
+    SwapEvent,
+)
 from testbed.scenario.estimators import EstimatorSpec
-from testbed.scenario.events import AddEvent, EstimatorEvent, HandOver, RemoveEvent, ShadowEvent, SwapEvent
 
 
 @dataclass(frozen=True)
 class Planned:
-    """One event of estimators, resolved.
+    """One event of estimators, resolved; that of ACKs gives one for each estimator.
 
-    step: the first at which it holds, 1 or more. spec: the estimator that begins, under the name of its results; None
-    where none does. source: the one from which it is handed the knowledge, or which leaves; None where there is none.
-    promoted: the name under which it has run until then.
+    step: the first at which it holds, 1 or more. name: whose estimates it is about. spec: the estimator that begins,
+    under the name of its results; None where none does. source: the one from which it is handed the knowledge, or which
+    leaves; None where there is none. promoted: the name under which it has run until then. place: its event's among
+    all.
     """
 
     event: EstimatorEvent
+    name: str
     step: int
     spec: EstimatorSpec | None
     source: EstimatorSpec | None
     handover: HandOver | None
     promoted: str | None = None
+    place: int = 0
+
+    @property
+    def replaces(self) -> bool:
+        """Whether another service goes on with the name."""
+        return isinstance(self.event, SwapEvent | AcksEvent)
 
 
 def planned(
@@ -43,7 +59,12 @@ def planned(
     """
     walk = _Walk({spec.name: spec for spec in specs}, steps, followed)
     order = sorted(range(len(events)), key=lambda i: events[i][1])
-    return [walk.take(events[i][0], max(1, events[i][1]), f"[{i if places is None else places[i]}]") for i in order]
+    out: list[Planned] = []
+    for i in order:
+        place = i if places is None else places[i]
+        plans = walk.take(events[i][0], max(1, events[i][1]), f"[{place}]")
+        out += [replace(plan, place=place) for plan in plans]
+    return out
 
 
 class _Walk:
@@ -52,31 +73,48 @@ class _Walk:
         self._names = set(now)
         self._touched: dict[str, int] = {}
 
-    def take(self, event: EstimatorEvent, step: int, at: str) -> Planned:
+    def take(self, event: EstimatorEvent, step: int, at: str) -> list[Planned]:
         if (isinstance(event.at, int) and not 1 <= event.at <= self._steps) or step > self._steps:
             raise problem(
                 f"got {shown(event.at)}; allowed: a step 1 … {self._steps}, those of the scenario", f"{at}.at"
             )
+        if isinstance(event, AcksEvent):
+            return self._switch(event, step, at)
+        return [self._take_one(event, step, at)]
+
+    def _take_one(self, event: AddEvent | ShadowEvent | RemoveEvent | SwapEvent, step: int, at: str) -> Planned:
         if isinstance(event, AddEvent):
             spec = self._begin(event.estimator, event.to.named(event.estimator), step, f"{at}.estimator", f"{at}.to")
-            return Planned(event, step, spec, None, "cold")
+            return Planned(event, spec.name, step, spec, None, "cold")
         source = self._there(event.estimator, step, f"{at}.estimator")
         if isinstance(event, ShadowEvent):
             spec = self._begin(event.name, event.to.named(event.name, source), step, f"{at}.name", f"{at}.to")
-            return Planned(event, step, spec, source, event.handover or "moments")
+            return Planned(event, spec.name, step, spec, source, event.handover or "moments")
         self._once(event.estimator, step, f"{at}.estimator")
         if isinstance(event, RemoveEvent):
             self._not_followed(event.estimator, f"{at}.estimator")
             del self._now[event.estimator]
-            return Planned(event, step, None, source, None)
+            return Planned(event, event.estimator, step, None, source, None)
         return self._swap(event, source, step, at)
+
+    def _switch(self, event: AcksEvent, step: int, at: str) -> list[Planned]:
+        """Each estimator is swapped for one like it."""
+        names = sorted(name for name, spec in self._now.items() if spec.until is None or step <= spec.until)
+        out = []
+        for name in names if event.estimator is None else [event.estimator]:
+            source = self._there(name, step, f"{at}.estimator")
+            self._once(name, step, f"{at}.estimator")
+            spec = source.model_copy(update={"acks": None if event.acks == "link" else event.acks})
+            self._now[name] = spec
+            out.append(Planned(event, name, step, spec, source, "full"))
+        return out
 
     def _swap(self, event: SwapEvent, source: EstimatorSpec, step: int, at: str) -> Planned:
         if not isinstance(event.to, str):
             spec = event.to.named(event.estimator, source)
             self._until(spec, step, f"{at}.to")
             self._now[event.estimator] = spec
-            return Planned(event, step, spec, source, event.handover or "moments")
+            return Planned(event, spec.name, step, spec, source, event.handover or "moments")
         if event.handover is not None:
             raise problem(f"got {event.handover!r}; allowed: none, for {event.to!r} has a state", f"{at}.handover")
         promoted = self._there(event.to, step, f"{at}.to")
@@ -88,7 +126,7 @@ class _Walk:
         self._until(spec, step, f"{at}.to")
         del self._now[event.to]
         self._now[event.estimator] = spec
-        return replace(Planned(event, step, spec, source, None), promoted=event.to)
+        return replace(Planned(event, spec.name, step, spec, source, None), promoted=event.to)
 
     def _there(self, name: str, step: int, at: str) -> EstimatorSpec:
         spec = self._now.get(name)

@@ -13,7 +13,7 @@ _NUMBERS = re.compile(r"\[\n((?: *[-+0-9.eE]+,\n)+) *\]")
 
 def to_dict(scenario: Scenario) -> dict[str, Any]:
     """The resolved scenario as plain tables, lists, texts and numbers; what is left out has no value in TOML."""
-    table = _without_none(scenario.model_dump(mode="json"))
+    table = _without_none(scenario.model_dump(mode="json", by_alias=True))
     estimators = table.pop("estimators")
     if estimators:
         table["estimators"] = [_flat(spec) for spec in estimators]

@@ -17,7 +17,11 @@ def asyncapi() -> dict[str, Any]:
     channels: dict[str, tuple[str, str, str]] = {
         "clock": (keys.clock, "clock", "orchestrator → controller: how far time may go"),
         "command": (keys.command, "command", "orchestrator → all roles"),
-        "change": (keys.change("{link}"), "change", "orchestrator → link: other values for keys of its table"),  # type: ignore[arg-type]
+        "change": (
+            keys.change("{part}"),
+            "change",
+            "orchestrator → link (part: control, observation, ack), plant or controller: what is other from a step on",
+        ),
         "controlSent": (keys.sent("control"), "control", "controller → link, and estimators, which know u as sent"),
         "controlDelivered": (keys.delivered("control"), "control", "link → plant"),
         "observationSent": (keys.sent("observation"), "observation", "plant → link"),
@@ -44,8 +48,8 @@ def asyncapi() -> dict[str, Any]:
                 f"{schemas['description']} {schemas['x-bundle']} "
                 f"Transport: Eclipse Zenoh; a role is a client of the orchestrator's session. "
                 f"A query on {keys.scenario} is answered with JSON: the run's identity and its resolved scenario "
-                f"(TOML). A query on {keys.ask} with JSON, the link and the keys of its table to set, changes a link "
-                "while the run goes. A role declares its subscriptions, then the liveliness token "
+                f"(TOML). A query on {keys.ask} with JSON orders an event, holds the clock, or asks how the run is. "
+                "A role declares its subscriptions, then the liveliness token "
                 f"{keys.presence('{role}')}; "
                 "the run starts when all are there. Each key has one sender, and that of an estimate may change from "
                 "one step to the next, with the numbers going on; "
@@ -59,7 +63,9 @@ def asyncapi() -> dict[str, Any]:
             name: {
                 "address": address,
                 "description": text,
-                "parameters": {p: {} for p in ("run", "name", "role", "link", "end") if "{" + p + "}" in address},
+                "parameters": {
+                    p: {} for p in ("run", "name", "role", "link", "part", "end") if "{" + p + "}" in address
+                },
                 "messages": {message: {"$ref": f"#/components/messages/{message}"}},
             }
             for name, (address, message, text) in channels.items()

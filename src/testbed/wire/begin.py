@@ -22,7 +22,6 @@ class _Header(BaseModel):
     late: bool
     lanes: list[_Step]
     orders: list[Order]
-    changes: _Step
     life: _Step
 
 
@@ -31,15 +30,15 @@ class Begin:
     """After ``step`` steps, with the state of each block of lanes.
 
     late: the run goes already, so that what was sent since is asked for. orders: what an estimator's service was told
-    on its way, to be done again, with the bytes of a snapshot each. changes: orders to a link that are in the scenario.
-    life: how often the role was started before.
+    on its way, to be done again, with the bytes of a snapshot each. changes: the messages of that type that it was
+    sent so far. life: how often the role was started before.
     """
 
     step: int = 0
     late: bool = False
     states: Mapping[int, bytes] = field(default_factory=dict)
     orders: tuple[tuple[Order, bytes], ...] = ()
-    changes: int = 0
+    changes: tuple[bytes, ...] = ()
     life: int = 0
 
     def to_bytes(self) -> bytes:
@@ -48,10 +47,10 @@ class Begin:
             late=self.late,
             lanes=list(self.states),
             orders=[order for order, _ in self.orders],
-            changes=self.changes,
             life=self.life,
         )
-        return bundle([header.model_dump_json().encode(), *self.states.values(), *(data for _, data in self.orders)])
+        parts = [*self.states.values(), *(data for _, data in self.orders), *self.changes]
+        return bundle([header.model_dump_json().encode(), *parts])
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Begin:
@@ -61,11 +60,12 @@ class Begin:
             header = _Header.model_validate_json(text)
         except ValidationError:
             raise UsageError("what the orchestrator says of the beginning is not understood") from None
-        if len(parts) != len(header.lanes) + len(header.orders):
+        given, told = len(header.lanes), len(header.lanes) + len(header.orders)
+        if len(parts) < told:
             raise UsageError("what the orchestrator says of the beginning is not whole")
-        states = dict(zip(header.lanes, parts, strict=False))
-        orders = zip(header.orders, parts[len(header.lanes) :], strict=True)
-        return cls(header.step, header.late, states, tuple(orders), header.changes, header.life)
+        states = dict(zip(header.lanes, parts[:given], strict=True))
+        orders = zip(header.orders, parts[given:told], strict=True)
+        return cls(header.step, header.late, states, tuple(orders), tuple(parts[told:]), header.life)
 
 
 AT_START = Begin()

@@ -21,13 +21,13 @@ from testbed.wire.messages import Name
 class Order(BaseModel):
     """give: the snapshot of the block of lanes that begins at ``lane``. take: start the block from a snapshot.
 
-    serve: estimates of step + 1 and later go under ``name``. leave: no more estimates. step: the steps that are done;
-    in a cold start no snapshot comes.
+    serve: estimates of step + 1 and later go under ``name``. leave: no more estimates. ready: say whether all is done.
+    step: the steps that are done; in a cold start no snapshot comes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    action: Literal["give", "take", "serve", "leave"]
+    action: Literal["give", "take", "serve", "leave", "ready"]
     step: Annotated[int, Field(ge=0, le=2**31)]
     lane: Annotated[int, Field(ge=0, le=2**31)] = 0
     form: Literal["cold", "moments", "full"] = "moments"
@@ -38,12 +38,22 @@ class Refused(TestbedError):
     """A service did not do what it was asked."""
 
 
+class Behind(TestbedError):
+    """A service was started anew, and has not come so far."""
+
+
 def ask(bus: Bus, key: str, order: Order, data: bytes = b"") -> bytes:
-    """The answer of a service. Raises Refused where it says no, BusError where it does not answer in time."""
+    """The answer of a service.
+
+    Raises Refused where it says no, Behind where it is not there yet, BusError where it does not answer in time.
+    """
     answer = bus.ask(key, bundle([order.model_dump_json().encode(), data]))
     if answer[:1] == b"{" and (error := json.loads(answer).get("error")) is not None:
-        raise Refused(str(error))
+        raise (Behind if error == _BEHIND else Refused)(str(error))
     return answer
+
+
+_BEHIND = "behind"
 
 
 def answered(do: Callable[[Order, bytes], bytes], question: bytes) -> bytes:
@@ -51,6 +61,8 @@ def answered(do: Callable[[Order, bytes], bytes], question: bytes) -> bytes:
     try:
         header, data = unbundle(question)
         return do(Order.model_validate_json(header), data) or b"{}"
+    except Behind:
+        text = _BEHIND
     except (TestbedError, ValidationError) as error:
         text = str(error)
     except Exception as error:

@@ -48,9 +48,9 @@ class Keys:
         """Where the recorded lanes of what goes over ``key`` are copied to."""
         return f"{self.prefix}/tap/{key[len(self.prefix) + 1 :]}"
 
-    def change(self, link: LinkName) -> str:
-        """Where the orchestrator tells a link of a change."""
-        return f"{self.prefix}/{link}/change"
+    def change(self, part: str) -> str:
+        """Where the orchestrator tells a link, the plant or the controller of a change."""
+        return f"{self.prefix}/{part}/change"
 
     @property
     def ask(self) -> str:
@@ -76,6 +76,18 @@ class Keys:
     def state(self, role: str) -> str:
         """Where a role gives its state now and then."""
         return f"{self.prefix}/state/{role}"
+
+    def told(self, role: str) -> str:
+        """Where the orchestrator tells an estimator's service, in real time, what to do after a step to come."""
+        return f"{self.handover(role)}/told"
+
+    def said(self, role: str) -> str:
+        """What the service says to that."""
+        return f"{self.handover(role)}/said"
+
+    def handed(self, role: str) -> str:
+        """Where another service hands its state to this one."""
+        return f"{self.handover(role)}/state"
 
     def status(self, role: str) -> str:
         return f"{self.prefix}/status/{role}"

@@ -48,7 +48,11 @@ class MemoryNetwork:
             return True
         if self._random is not None:
             self._order.rotate(self._random.randrange(len(self._order)))
-        self._order.popleft().deliver_one()
+        bus = self._order.popleft()
+        if bus.paused:
+            bus.withheld += 1
+        else:
+            bus.deliver_one()
         return True
 
     def run(self, until: Callable[[], bool]) -> bool:
@@ -102,6 +106,8 @@ class MemoryBus:
     def __init__(self, network: MemoryNetwork) -> None:
         self._network = network
         self.inbox: deque[Callable[[], None]] = deque()
+        self.paused, self.withheld = False, 0
+        """Whether it gets no messages for a while, and how many of those that wait for it had their turn."""
         self.published_ns = self.arrived_ns = 0
 
     @property
@@ -114,6 +120,16 @@ class MemoryBus:
     def take_timed(self, handler: Handler, key: str, payload: bytes, published_ns: int) -> None:
         self.published_ns, self.arrived_ns = published_ns, self.clock.date_ns()
         handler(key, payload)
+
+    def pause(self, for_s: float) -> None:
+        """Let no message come here for so many seconds; none is lost."""
+        self.paused = True
+        self.at(self.clock.monotonic_ns() + round(1e9 * for_s), self._go_on)
+
+    def _go_on(self) -> None:
+        self.paused = False
+        self._network._order.extend([self] * self.withheld)
+        self.withheld = 0
 
     def deliver_one(self) -> None:
         self.inbox.popleft()()

@@ -191,11 +191,17 @@ class Command(Message):
 
 
 class Change(Message):
-    """An order to one link: from step ``step`` on, some keys of its table have other values."""
+    """An order to one link, the plant or the controller: what is other from step ``step`` on."""
 
     type: Literal["change"] = "change"
     step: Count
-    set: Annotated[dict[str, Any], Field(description="keys of the link's table as in a scenario; 'none' removes one")]
+    set: Annotated[
+        dict[str, Any],
+        Field(
+            description="for a link: keys of its table as in a scenario, 'none' removes one; for the plant and the "
+            "controller: the event's table"
+        ),
+    ]
 
 
 class Status(Message):

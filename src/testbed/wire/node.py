@@ -34,6 +34,27 @@ class Gate:
 
     def __init__(self, passed_over: int | None = None) -> None:
         self.passed_over = passed_over
+        self.gone_by = 0
+        """Packets of a block and key that nobody can have any more: of the block that is furthest."""
+        self._kept: list[Callable[[], None]] | None = None
+
+    def keep(self) -> None:
+        """Keep what comes from now on until it opens."""
+        self._kept = []
+
+    def keeps(self, packet: Packet, take: Callable[[], None]) -> bool:
+        """Whether a packet that comes to the closed gate is kept."""
+        if self._kept is None:
+            self.gone_by = max(self.gone_by, packet.step - packet.FIRST_STEP + 1)
+            return False
+        self._kept.append(take)
+        return True
+
+    def open(self, passed_over: int) -> None:
+        """Let pass what is of interest, and first what was kept of it."""
+        kept, self._kept, self.passed_over = self._kept or [], None, passed_over
+        for take in kept:
+            take()
 
 
 OPEN = Gate(0)
@@ -147,8 +168,8 @@ class Node:
         source: the role that sends here, or what says of a header whether its sender is right. needs: arrays that a
         packet must have here. last: the last step, where it is not that of the run. cut: packets hold the recorded
         lanes only. gate: the packets that are passed over at first; the first that is taken has the number that it
-        must have had all before it come. first: the number of the first message that is no packet; None: any, as in a
-        role that begins late.
+        must have had all before it come, or follows on the one that was seen before. first: the number of the first
+        message that is no packet; None: any, as in a role that begins late.
         """
         sizes = self.sizes if last is None else replace(self.sizes, steps=last)
         gate = self._from if gate is OPEN else gate
@@ -158,8 +179,8 @@ class Node:
         if is_packet:
             first = 0 if gate.passed_over == 0 else None
         elif self.begin.late:
-            first = self.begin.changes if model is Change else None
-        due = self._inputs[key] = _Input(key, first)
+            first = 0 if model is Change else None
+        due = self._inputs[key] = _Input(key, first, of_changes=model is Change)
         blocks = _blocks(self._tap, self.sizes) if cut else None
 
         def receive(payload: bytes) -> None:
@@ -168,20 +189,29 @@ class Node:
                     if isinstance(outcome, Rejected):
                         raise outcome
                     header, arrays = outcome
-                    if due.number is None:
-                        if isinstance(header, Packet):
-                            if not _is_due(header, gate):
-                                continue
-                            due.number = turns.begin(gate.passed_over or 0, header, blocks)
-                        elif is_source(header):
-                            due.number = header.seq
+                    early = False
+                    if gate is not OPEN and isinstance(header, Packet):
+                        if gate.passed_over is None:
+                            if not gate.keeps(header, partial(receive, message)):
+                                due.number = header.seq + 1
+                            continue
+                        early = header.step - header.FIRST_STEP < gate.passed_over
+                        begun = turns.begin(gate.passed_over, blocks)
+                        if due.number is None:
+                            due.number = header.seq if early else begun
+                    elif due.number is None and is_source(header):
+                        due.number = header.seq
                     if not is_source(header):
                         raise Rejected("source", f"from {header.source}")
+                    if due.number is not None and header.seq < due.number:
+                        self.repeated += 1
+                        continue
                     if header.seq != due.number:
-                        if due.number is not None and header.seq < due.number:
-                            self.repeated += 1
-                            continue
                         raise Rejected("sequence", f"number {header.seq}, expected {due.number}")
+                    if early:
+                        turns.check_early(header)
+                        due.number += 1
+                        continue
                     for name in needs:
                         if name not in arrays:
                             raise Rejected("arrays", f"lacks {name}")
@@ -207,7 +237,14 @@ class Node:
         self.bus.subscribe(key, hold if self._held is not None and is_packet and not cut else take)
 
     def serve(self, service: object) -> None:
-        """Say what service this is the node of; where it begins with a state, it is given that."""
+        """Say what service this is the node of; where it begins with a state, it is given that.
+
+        Before that it is told of the changes that were made.
+        """
+        for due in self._inputs.values():
+            if due.of_changes:
+                for message in self.begin.changes:
+                    due.receive(message)
         if getattr(service, "gives_state", False):
             self._service = service  # type: ignore[assignment]
             for lane, state in self.begin.states.items():
@@ -300,8 +337,8 @@ class Node:
 class _Input:
     """What is due on a key that a role listens to: the number of the next message, None until the first has come."""
 
-    def __init__(self, key: str, number: int | None) -> None:
-        self.key, self.number = key, number
+    def __init__(self, key: str, number: int | None, *, of_changes: bool) -> None:
+        self.key, self.number, self.of_changes = key, number, of_changes
         self.receive: Callable[[bytes], None] = lambda payload: None
 
 
@@ -324,16 +361,21 @@ class _Turns:
     def __init__(self, per_packet: int | None, lanes: int) -> None:
         self._per_packet, self._lanes = per_packet, lanes
         self._due: dict[int, int] = {}
+        self._passed_over = 0
 
-    def begin(self, passed_over: int, packet: Packet, blocks: int | None = None) -> int:
-        """Let so many packets of each block be done; the number of the next one on the key.
+    def begin(self, passed_over: int, blocks: int | None = None) -> int:
+        """Let so many packets of each block be done; the number of the next one on the key, where all are done.
 
         blocks: how many there are, where not all lanes come.
         """
-        size = self._per_packet or self._lanes
-        for lane in range(0, self._lanes, size):
-            self._due[lane] = packet.FIRST_STEP + passed_over
-        return passed_over * (len(self._due) if blocks is None else blocks)
+        self._passed_over = passed_over
+        every = len(range(0, self._lanes, self._per_packet or self._lanes))
+        return passed_over * (every if blocks is None else blocks)
+
+    def check_early(self, packet: Message) -> None:
+        """Of a packet from before the beginning: none of its block from behind it has come."""
+        if isinstance(packet, Packet) and packet.lane in self._due:
+            raise Rejected("order", f"step {packet.step}, expected {self._due[packet.lane]}")
 
     def check(self, packet: Packet) -> None:
         lane, size = packet.lane, self._per_packet
@@ -341,7 +383,7 @@ class _Turns:
             raise Rejected("range", f"lanes {lane}…{lane + packet.lanes - 1} are not a packet of this run")
         step, due = packet.step, self._due.get(lane)
         if due is None:
-            due = packet.FIRST_STEP
+            due = packet.FIRST_STEP + self._passed_over
         if step != due:
             raise Rejected("order", f"step {step}, expected {due}")
         self._due[lane] = due + 1
@@ -349,10 +391,6 @@ class _Turns:
 
 def _is_from(source: str, header: Message) -> bool:
     return header.source == source
-
-
-def _is_due(packet: Packet, gate: Gate) -> bool:
-    return gate.passed_over is not None and packet.step - packet.FIRST_STEP >= gate.passed_over
 
 
 def _blocks(lanes: int, sizes: Sizes) -> int:

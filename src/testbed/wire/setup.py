@@ -10,6 +10,9 @@ from typing import Protocol, get_args
 
 from testbed.scenario import ClosedLoop, Scenario, Transport, parse_scenario, to_toml
 from testbed.scenario.backend import real_links
+from testbed.scenario.estimator_events import AcksEvent
+from testbed.scenario.estimators import NewService
+from testbed.scenario.events import Event, KillEvent, RestartEvent
 from testbed.wire.begin import AT_START, Begin
 from testbed.wire.bus import Bus
 from testbed.wire.codec import Sizes
@@ -139,6 +142,7 @@ class Setup:
         s = self.scenario
         specs = [*s.estimators, *(planned.spec for planned in s.swaps)]
         told = any(spec is not None and spec.acks == "perfect" for spec in specs)
+        told = told or any(_asks_for_acks(event) for event in s.events if not event.timed)
         return s.links.ack.mode != "none" or s.record != "none" or told
 
     @property
@@ -146,11 +150,12 @@ class Setup:
         """Whether the collector needs the input that was applied."""
         return self.scenario.cost is not None and self.sizes.q > 0
 
-    @property
+    @cached_property
     def snapshot_every(self) -> int:
         """Steps from one snapshot of a role to the next; 0: none."""
         recovery = self.scenario.recovery
-        if (self.single and not recovery.asked) or recovery.nothing_kept:
+        ended = any(isinstance(event, KillEvent | RestartEvent) for event in self.scenario.events)
+        if recovery.nothing_kept or (self.single and not (recovery.asked or ended)):
             return 0
         return recovery.every or max(8, min(_KEPT_STEPS, _KEPT_BYTES // self._bytes_a_step))
 
@@ -183,6 +188,14 @@ class Setup:
     def from_json(cls, payload: bytes) -> Setup:
         data = json.loads(payload)
         return cls(data["run"], parse_scenario(data["scenario"]))
+
+
+def _asks_for_acks(event: Event) -> bool:
+    """Whether an estimator may be told of every control packet after an event that waits."""
+    if isinstance(event, AcksEvent):
+        return event.acks == "perfect"
+    to = getattr(event, "to", None)
+    return isinstance(to, NewService) and to.acks == "perfect"
 
 
 class Role(Protocol):

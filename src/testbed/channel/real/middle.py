@@ -71,7 +71,7 @@ def directions(settings: SteppedImpairments) -> tuple[Impairments, Impairments]:
     it is the acknowledgements, and they meet what the key ``back`` says, as in the model.
     """
     if isinstance(settings.transport, TcpTransport):
-        return settings, settings.back or settings
+        return settings, settings.backwards
     return settings, Impairments(delay=settings.delay)
 
 

@@ -71,6 +71,8 @@ class TcpProxy(SocketLink):
     def check(settings: Impairments) -> None:
         if settings.loss.kind != "none":
             raise UsageError(f"loss: got {settings.loss.kind!r}; {_INSTEAD}")
+        if not settings.up:
+            raise UsageError(f"up: got false; {_INSTEAD}")
         for key in ("reorder", "duplicate", "corrupt"):
             if getattr(settings, key) is not None:
                 raise UsageError(f"{key}: {_INSTEAD}")

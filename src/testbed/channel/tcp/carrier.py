@@ -96,8 +96,7 @@ class TcpCarrier:
         """Other impairments from now on: forwards these, backwards those of `back`, or else these too."""
         forward, backward = self._pipelines[:2]
         forward.change(settings)
-        back = settings.back if isinstance(settings, SteppedImpairments) else None
-        backward.change(back or settings)
+        backward.change(settings.backwards if isinstance(settings, SteppedImpairments) else settings)
 
     def as_counters(self) -> dict[str, int]:
         """What the connections did so far."""

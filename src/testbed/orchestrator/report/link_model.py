@@ -37,7 +37,7 @@ def expected_links(summary: Summary, scenario_toml: str) -> dict[str, Expected]:
         tomllib.TOMLDecodeError: the scenario is not TOML.
     """
     tables = tomllib.loads(scenario_toml).get("links", {})
-    eventful = {event.link for event in summary.events}
+    eventful = {name for event in summary.events for name in (event.link, *(event.links or ()))}
     expected = {}
     for name, figures in summary.links.items():
         if name in eventful or _TIME & set(tables.get(name, {})):

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from testbed.orchestrator.report import csv_data, svg
 from testbed.orchestrator.report.derived import common_band, settled
 from testbed.orchestrator.report.figures import axes, cost, covariance, excess, lateness, links, nees
+from testbed.orchestrator.report.figures.events import mark_events, shown
 from testbed.orchestrator.report.figures.ratio import ratios
 from testbed.orchestrator.report.html import ENVIRONMENT, PageFigure, page_figure
 from testbed.orchestrator.report.link_model import Expected, expected_links
@@ -33,6 +34,7 @@ def report_html(summary: Summary, scenario_toml: str) -> str:
         dots=summary.completed_steps <= axes.DOTS_STEPS_MAX,
         upper_leaves=summary.completed_steps > 0 and covariance.choose_scale(summary).upper_leaves,
         below=bool(ratios(summary)),
+        marked=bool(shown(summary)),
         robust=[name for name, figures in summary.estimators.items() if figures.kind.startswith("rse")],
     )
 
@@ -88,9 +90,21 @@ def _figures(summary: Summary, expected: dict[str, Expected]) -> dict[str, PageF
     ]
     shown = [entry for entry in available if entry[1]]
     return {
-        name: page_figure(number, name, draw, numbers(), label)
+        name: page_figure(number, name, _marked(name, draw, summary), numbers(), label)
         for number, (name, _, draw, numbers, label) in enumerate(shown, start=1)
     }
+
+
+def _marked(name: str, draw: Callable[[], Figure], summary: Summary) -> Callable[[], Figure]:
+    """The figure with its events, if it goes along the steps."""
+
+    def drawn() -> Figure:
+        figure = draw()
+        if name != "links":
+            mark_events(figure, summary)
+        return figure
+
+    return drawn
 
 
 def _given(part: Part | None) -> Part:

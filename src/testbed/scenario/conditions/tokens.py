@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from string import whitespace
 from typing import NamedTuple, NoReturn
 
 from testbed.errors import UsageError
@@ -66,7 +67,7 @@ class Pieces:
 
     def _unknown(self) -> NoReturn:
         position = self._position
-        while self._text[position].isspace():
+        while self._text[position] in whitespace:  # of ASCII, as in the patterns
             position += 1
         found = self._text[position]
         hint = f"; did you mean {_HINTS[found]!r}?" if found in _HINTS else ""

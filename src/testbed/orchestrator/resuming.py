@@ -1,0 +1,186 @@
+"""A run that goes on after its orchestrator has died: what it was, and where it begins again.
+
+Its commands have become events of the scenario, at the steps at which they took effect; what an event does after the
+checkpoint it does again. Where a condition is looked at, the run begins anew: what a condition has seen is in no
+checkpoint. The results are the same either way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from testbed.errors import UsageError
+from testbed.estimator.service import builder, role_of
+from testbed.orchestrator.journal import Found, read
+from testbed.orchestrator.recovery import Checkpoint
+from testbed.orchestrator.roles import RoleSpec
+from testbed.orchestrator.services import Origin, Turn
+from testbed.orchestrator.summary import Downtime, Happened, Recovered
+from testbed.scenario import EstimatorSpec, Scenario, parse_scenario
+from testbed.wire.messages import Status
+
+if TYPE_CHECKING:
+    from testbed.orchestrator.conductor import Conductor
+
+FOLDER = "journal"
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """A run that was begun. given: its scenario as it was; scenario: with what was commanded.
+
+    origins: of the events that were commanded, by their place among all. refused: what was commanded and not done.
+    lost: what of the journal is damaged, a line each.
+    """
+
+    run: str
+    given: Scenario
+    scenario: Scenario
+    step: int
+    found: Found
+    origins: dict[int, Origin]
+    refused: tuple[Happened, ...]
+    lost: tuple[str, ...]
+
+
+def facts_of(conductor: Conductor, step: int) -> dict[str, Any]:
+    """What the orchestrator knows, beside figures and states, as it was after a completed step."""
+    services = conductor.services
+    turns = {
+        name: [
+            {"first": t.first, "role": t.role, "spec": t.spec.model_dump(mode="json"), "carried": t.carried}
+            for t in of_name
+            if t.first <= step
+        ]
+        for name, of_name in services.turns.items()
+    }
+    return {
+        "turns": {name: of_name for name, of_name in turns.items() if of_name},
+        "last": {name: services.last[name] for name, of_name in turns.items() if of_name},
+        "happened": [_json(entry) for entry in services.happened if entry.step <= step],
+        "others": [_json(entry) for entry in conductor.timeline.others if entry.step <= step],
+        "downtimes": [_json(entry) for entry in services.downtimes if entry.step <= step],
+        "recovered": [_json(entry) for entry in conductor.recovery.happened],
+    }
+
+
+def resumed(folder: Path) -> Resumed:
+    """What a run's folder says of a run that was not finished. Raises UsageError where there is none."""
+    path = folder / FOLDER
+    if not path.is_dir():
+        raise UsageError(f"{folder}: no run to be resumed; allowed: the folder of a run that was not finished")
+    found = read(path)
+    try:
+        given = parse_scenario(found.begin["scenario"], source=f"{path}: scenario")
+        run = str(found.begin["run"])
+        commands = {int(note["number"]): note for note in found.notes if "command" in note}
+        refused = tuple(Happened.model_validate(note["refused"]) for note in found.notes if "refused" in note)
+        origins = {
+            len(given.events) + place: Origin(note["by"], number, note["when"], note["true"])
+            for place, (number, note) in enumerate(sorted(commands.items()))
+        }
+        tables = [note["command"] for _, note in sorted(commands.items())]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UsageError(f"{path}: not the journal of a run: {' '.join(str(error).split())}") from None
+    if given.clock.real:
+        raise UsageError(
+            f"{folder}: its run keeps real time, and what was due meanwhile cannot be made up; allowed: to begin anew"
+        )
+    scenario = _with_events(given, tables, path)
+    conditions = any(not event.timed for event in given.events)
+    step = 0 if conditions or found.checkpoint is None else found.checkpoint.step
+    return Resumed(run, given, scenario, step, found, origins, refused, found.lost)
+
+
+def _with_events(given: Scenario, tables: list[dict[str, Any]], path: Path) -> Scenario:
+    if not tables:
+        return given
+    events = [event.model_dump(mode="json", exclude_none=True) for event in given.events]
+    data = {**given.model_dump(mode="json", exclude_none=True), "events": [*events, *tables]}
+    try:
+        return Scenario.model_validate(data)
+    except ValidationError as error:
+        raise UsageError(f"{path}: what was commanded does not fit the scenario: {error}") from None
+
+
+def roles_at(roles: list[RoleSpec], begun: Resumed) -> list[RoleSpec]:
+    """The roles of a run where it goes on."""
+    if not begun.step:
+        return roles
+    assert begun.found.checkpoint is not None
+    others = [role for role in roles if not role.name.startswith(role_of(""))]
+    return others + [
+        _service(name, turn)
+        for name, turns in _turns(begun.found.checkpoint.facts).items()
+        if begun.found.checkpoint.facts["last"][name] >= begun.step
+        for turn in turns[-1:]
+    ]
+
+
+def services_at(begun: Resumed) -> dict[str, EstimatorSpec]:
+    """The estimators of the roles that joined on the way, where the run goes on."""
+    if not begun.step:
+        return {}
+    assert begun.found.checkpoint is not None
+    turns = [turns[-1] for turns in _turns(begun.found.checkpoint.facts).values()]
+    return {turn.role: turn.spec for turn in turns if turn.first > 1}
+
+
+def go_on(conductor: Conductor, begun: Resumed) -> None:
+    """Let a new conductor know what the old one knew."""
+    timeline, services, step = conductor.timeline, conductor.services, begun.step
+    numbers = [origin.number for origin in begun.origins.values()]
+    numbers += [entry.number for entry in begun.refused if entry.number is not None]
+    timeline.name_origins(begun.origins, 1 + max(numbers, default=-1))
+    services.pending = [
+        replace(entry, origin=begun.origins.get(entry.origin.number, entry.origin)) for entry in services.pending
+    ]
+    if not step:
+        timeline.others += begun.refused
+        return
+    checkpoint = begun.found.checkpoint
+    assert checkpoint is not None
+    facts = checkpoint.facts
+    conductor.collector.resume(step, checkpoint.collector, (part.content for part in begun.found.figures))
+    services.turns, services.last = _turns(facts), dict(facts["last"])
+    done = [entry for entry in services.pending if entry.step is not None and entry.step <= step]
+    refused = {h["number"] for h in facts["happened"] if not h.get("ok", True)}
+    services.made = [(entry.plan.event, entry.step or 0) for entry in done if entry.origin.number not in refused]
+    services.pending = [entry for entry in services.pending if entry not in done]
+    services.happened = [Happened.model_validate(entry) for entry in facts["happened"]]
+    services.downtimes = [Downtime.model_validate(entry) for entry in facts["downtimes"]]
+    services.count_again()
+    timeline.others += [Happened.model_validate(entry) for entry in facts["others"]]
+    known = {entry.number for entry in (*timeline.others, *services.happened) if not entry.ok}
+    timeline.others += [entry for entry in begun.refused if entry.number not in known]
+    timeline.begin_after(step)
+    conductor.recovery.happened = [Recovered.model_validate(entry) for entry in facts["recovered"]]
+    states: dict[str, dict[int, bytes]] = {}
+    for (role, lane), data in checkpoint.states.items():
+        states.setdefault(role, {})[lane] = data
+    conductor.recovery.checkpoint = Checkpoint(step, states)
+    conductor.begin_after(step, {role: Status.model_validate_json(word) for role, word in facts["reports"].items()})
+
+
+def _turns(facts: Any) -> dict[str, list[Turn]]:
+    return {
+        name: [Turn(t["first"], t["role"], EstimatorSpec.model_validate(t["spec"]), t["carried"]) for t in turns]
+        for name, turns in facts["turns"].items()
+    }
+
+
+def _service(name: str, turn: Turn) -> RoleSpec:
+    """An estimator's service as it was started: the one of the scenario, or one that joined later."""
+    base = turn.spec.name
+    if turn.role == role_of(base) and turn.first == 1:
+        return RoleSpec(turn.role, builder(base), "testbed.estimator", ("--name", base))
+    arguments = ("--name", base, "--role", turn.role, "--spec", turn.spec.model_dump_json())
+    return RoleSpec(turn.role, builder(base, turn.spec), "testbed.estimator", arguments)
+
+
+def _json(entry: Any) -> Any:
+    return entry.model_dump(mode="json", exclude_none=True)
