@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from orchestrator.wall_clock import MS, Simulated
 from testbed.errors import RunFailed, UsageError
 from testbed.estimator.snapshot import Snapshot
 from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.processes import NoProcesses
 from testbed.orchestrator.summary import Happened, Summary
 from testbed.wire.bundle import unbundle
 
@@ -299,9 +301,9 @@ def killers(monkeypatch: pytest.MonkeyPatch) -> list[Killer]:
         def __init__(self, *arguments: Any) -> None:
             super().__init__(*arguments)
             made.append(Killer(self))
-            self.timeline.processes = made[-1]
 
     monkeypatch.setattr("testbed.orchestrator.run.Conductor", Killed)
+    monkeypatch.setattr("testbed.orchestrator.run.OneProcess", lambda *_: made[-1])
     return made
 
 
@@ -324,10 +326,28 @@ def test_processes_are_ended_while_the_clock_stands_before_their_step(killers: l
     assert summary.events[-1].text == "restart link.ack: not done: link.ack would not end"
 
 
-def test_nobody_can_end_what_nobody_started(tmp_path: Path) -> None:
-    summary = run(scenario(estimators=AOE, events=[{"at": 8, "action": "kill", "role": "plant"}]), tmp_path)
-    assert [e.reason for e in summary.events] == ["nobody can kill plant in this run"]
-    assert summary.status == "complete"
+@pytest.mark.parametrize("end", ["kill", "restart"])
+def test_what_is_ended_is_recovered(end: str, tmp_path: Path) -> None:
+    summary = run(scenario(estimators=AOE, events=[{"at": 8, "action": end, "role": "plant"}]), tmp_path / "ended")
+    plain = run(scenario(estimators=AOE), tmp_path / "plain")
+    assert [(event.step, event.ok) for event in summary.events] == [(8, True)]
+    assert [(lost.role, lost.step) for lost in summary.recovered] == [("plant", 7)]
+    assert {**determined(summary), "recovered": (), "repeated": {}} == determined(plain)
+
+
+def test_a_pause_delays_and_changes_nothing(tmp_path: Path) -> None:
+    events = [{"at": 8, "action": "pause", "role": "plant", "for": "200 ms"}]
+    began = time.monotonic()
+    summary = run(scenario(estimators=AOE, events=events), tmp_path / "paused", 3)
+    assert time.monotonic() - began > 0.2
+    assert [(event.step, event.ok) for event in summary.events] == [(8, True)]
+    assert determined(summary) == determined(run(scenario(estimators=AOE), tmp_path / "plain"))
+
+
+def test_what_has_no_processes_ends_none() -> None:
+    for end in (lambda p: p.kill("plant"), lambda p: p.pause("plant", 1.0), lambda p: p.restart("plant")):
+        with pytest.raises(RunFailed, match=r"nobody can \w+ plant in this run"):
+            end(NoProcesses())
 
 
 def test_in_real_time_events_come_when_their_step_is_due(

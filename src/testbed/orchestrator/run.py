@@ -283,7 +283,10 @@ class Run:
             self._mark_start()
             priorities.raise_all({ORCHESTRATOR: os.getpid(), **pids()})
 
-        conductor.on_started = start
+        def rise(role: str) -> None:
+            priorities.raise_all({name: pid for name, pid in pids().items() if name == role})
+
+        conductor.on_started, conductor.on_present = start, rise
         try:
             yield
         finally:
