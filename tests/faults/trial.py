@@ -28,8 +28,8 @@ class Trial:
     seed: int
     table: Table
     recovery: Table
-    schedule: int
-    faults: list[Disturbance] = field(default_factory=list)
+    schedule: int | None
+    faults: list[Any] = field(default_factory=list)
     plain: Outcome | None = None
     disturbed: Outcome | None = None
     problems: list[str] = field(default_factory=list)
