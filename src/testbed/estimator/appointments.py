@@ -151,6 +151,9 @@ class Appointments:
         if held:
             self._service.count_on()
             self._service.outlet.release()
+        if self._joining is not None and self._joining.action == "serve" and order.to is None:
+            self._joining = None
+            self._service.outlet.release()
 
     def _leave(self, order: Ahead) -> None:
         if self._service.outlet.held_after != order.step:

@@ -389,6 +389,7 @@ class Conductor:
     def _leaves(self, role: str) -> None:
         self._roles.remove(role)
         self._gone.append(role)
+        self.recovery.down.pop(role, None)
 
     def _lost(self, role: str, reason: str) -> bool:
         """Whether a role that is lost is of no consequence but for the change that it was to make."""

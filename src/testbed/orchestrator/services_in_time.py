@@ -19,8 +19,9 @@ from testbed.orchestrator.collect import Collector
 from testbed.orchestrator.pacing import Pacing
 from testbed.orchestrator.services import START_S, Services, _Pending
 from testbed.orchestrator.summary import Downtime
-from testbed.wire.ahead import Ahead, Word
+from testbed.wire.ahead import Ahead, Word, unpack
 from testbed.wire.bus import Bus
+from testbed.wire.handover import Order
 from testbed.wire.setup import Setup
 
 _LEAD_NS = 50_000_000
@@ -28,6 +29,8 @@ _LEAD_NS = 50_000_000
 _LEAD_STEPS = 3
 _PATIENCE_S = 1.0
 """So long after its step a service that has not begun is given up; the estimates are late until then."""
+_SPARE = 8
+"""Services that are started before the run begins, so many at most."""
 _WATCHED = 10
 """Estimates after a change whose lateness is told."""
 
@@ -62,6 +65,10 @@ class ServicesInTime(Services):
         super().__init__(bus, setup, collector, say)
         self._pacing = pacing
         self._talks: dict[int, _Talk] = {}
+        self._handed: dict[str, dict[tuple[int, int], bytes]] = {}
+        """By new role: the states that it was handed, by step and first lane."""
+        self._untold: dict[str, _Talk] = {}
+        """Of new services that have begun: not all they were handed is known here."""
         self._numbers = 0
         period_ns = setup.scenario.clock.period_ns
         self._lead_ns = max(_LEAD_NS, _LEAD_STEPS * period_ns)
@@ -70,8 +77,10 @@ class ServicesInTime(Services):
             self._listen(turns[0].role)
 
     def all_are_there(self) -> bool:
-        """Whether the services are there, or refused, that would be launched in the first moment of the run."""
-        self._launch_due(0, 0)
+        """Whether the services of the first changes are there, or refused; started later they take time from others."""
+        for entry in list(self.pending[:_SPARE]):
+            if entry.launched_s is None and self._needs_service(entry):
+                self._launch(entry, time.monotonic())
         return all(entry.present for entry in self.pending if entry.launched_s is not None)
 
     def deciding(self, role: str) -> bool:
@@ -111,9 +120,15 @@ class ServicesInTime(Services):
         return super().overdue(deadline_s)
 
     def lost(self, role: str, reason: str) -> bool:
+        """As there; a change of one that is lost on the way is put off until it is back."""
         entry = self._of(role)
-        talk = None if entry is None else self._talks.get(id(entry))
-        return super().lost(role, reason if talk is None else talk.given_up or reason)
+        if entry is None:
+            for talk in [talk for talk in self._talks.values() if role in (talk.old, talk.new)]:
+                if role == talk.new or not self._is_handed(talk):
+                    self._put_off(talk)
+            return False
+        own = self._talks.get(id(entry))
+        return super().lost(role, reason if own is None else own.given_up or reason)
 
     def give_up(self) -> None:
         """The run is over: what has not happened will not."""
@@ -126,6 +141,34 @@ class ServicesInTime(Services):
 
     def _listen(self, role: str) -> None:
         self._bus.subscribe(self._keys.said(role), partial(self._said, role))
+        self._bus.subscribe(self._keys.handed(role), partial(self._is_given, role))
+
+    def _is_given(self, role: str, _: str, payload: bytes) -> None:
+        """A role is handed a state: it is to have that again should it be lost."""
+        handed, data = unpack(payload)
+        self._handed.setdefault(role, {})[handed.step, handed.lane] = data
+        if role in self._untold:
+            self._tell_origin(self._untold[role])
+
+    def _is_handed(self, talk: _Talk) -> bool:
+        states = self._handed.get(talk.new or "", {})
+        return all((talk.step - 1, lane) in states for lane, _ in self._setup.blocks)
+
+    def _tell_origin(self, talk: _Talk) -> None:
+        """Say from what a new service has begun, once that is known."""
+        plan, to, done = talk.entry.plan, talk.entry.role, talk.step - 1
+        assert to is not None
+        assert plan.spec is not None
+        if talk.old is not None and not self._is_handed(talk):
+            self._untold[to.name] = talk
+            return
+        self._untold.pop(to.name, None)
+        form, states = plan.handover or "cold", self._handed.pop(to.name, {})
+        orders = [
+            (Order(action="take", step=done, lane=lane, form=form), states.get((done, lane), b""))
+            for lane, _ in self._setup.blocks
+        ]
+        self.taken(to, plan.spec, done, orders)
 
     def _must_wait(self, entry: _Pending) -> bool:
         """Whether another change is to be made first, or is being made, of what this one builds on."""
@@ -194,6 +237,11 @@ class ServicesInTime(Services):
     def _begun(self, talk: _Talk, size: int) -> None:
         """The new one serves."""
         del self._talks[id(talk.entry)]
+        if talk.entry.role is not None:
+            self._tell_origin(talk)
+        elif talk.new is not None:
+            self._handed.pop(talk.new, None)
+            self.served(talk.new, Order(action="serve", step=talk.step - 1, name=talk.entry.plan.name))
         if talk.entry.plan.replaces and talk.old is not None:
             self.leaves(talk.old)
             self._tell(talk, talk.old, "leave")
@@ -249,6 +297,8 @@ class ServicesInTime(Services):
             self._take_back(talk)
         if talk.agreed:
             self._tell(talk, talk.old, "stay", to=talk.new)
+        if talk.asked == "serve":
+            self._tell(talk, talk.new, "stay")
 
     def _refuse(self, entry: _Pending, reason: str) -> None:
         talk = self._talks.get(id(entry))

@@ -26,7 +26,8 @@ class Ahead(_Model):
     hand: give the role ``to`` the state; where ``stop``, hold back the estimates of later steps until told to leave or
     to stay. begin: start from the state that is handed over, or, if cold and not ``handed``, at once from the prior.
     serve: publish the estimates of later steps under ``name`` from when the other has handed over. leave: no more
-    estimates. stay: do not hand over to ``to``, publish what is held back and go on. number: the words to it repeat it.
+    estimates. stay: do not hand over to ``to``, or without ``to`` do not serve, publish what is held back and go on.
+    number: the words to it repeat it.
     """
 
     action: Literal["hand", "begin", "serve", "leave", "stay"]

@@ -40,7 +40,7 @@ class Gate:
 
     def keep(self) -> None:
         """Keep what comes from now on until it opens."""
-        self._kept = []
+        self._kept = self._kept or []
 
     def keeps(self, packet: Packet, take: Callable[[], None]) -> bool:
         """Whether a packet that comes to the closed gate is kept."""
