@@ -187,4 +187,3 @@ def _deliver(handler: Callable[[str, bytes], None], message: _Message) -> None:
     if not message.lost:
         message.taken += 1
         handler(message.key, message.payload)
-

@@ -49,6 +49,7 @@ class Observed:
         stack.enter_context(patch.object(recorder, "messages_json_schema", _schemas))
         stack.enter_context(patch.object(outcome, "versions", _versions))
         stack.enter_context(patch("testbed.orchestrator.services.START_S", 0.0))
+        stack.enter_context(patch("testbed.orchestrator.run.secrets.token_hex", lambda _: "00000000"))
         return stack
 
 

@@ -7,6 +7,7 @@ import random
 import signal
 import threading
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,10 +91,11 @@ def _disturbed(table: Table, folder: Path, coming: list[Signal]) -> tuple[Summar
             command, pid = roles[int(one.which * len(roles))]
             log.append(f"past step {completed}: {one.number.name} to {_shown(command)}")
             killed.append(_shown(command))
-            os.kill(pid, one.number)
-            if one.cont_s is not None:
-                time.sleep(one.cont_s)
-                os.kill(pid, signal.SIGCONT)
+            with suppress(ProcessLookupError):
+                os.kill(pid, one.number)
+                if one.cont_s is not None:
+                    time.sleep(one.cont_s)
+                    os.kill(pid, signal.SIGCONT)
 
     sender = threading.Thread(target=send, daemon=True)
     sender.start()

@@ -181,9 +181,8 @@ def _link(draw: random.Random) -> Table:
     if draw.random() < 0.2:
         link["corrupt"] = {"chance": 0.1}
     if draw.random() < 0.4:
-        link["transport"] = draw.choice(
-            [{"kind": "udp"}, {"kind": "udp", "late": "deliver"}, {"kind": "tcp"}, {"kind": "tcp", "congestion": "reno"}]
-        )
+        tcp = {"kind": "tcp", "congestion": draw.choice(("cubic", "reno"))}
+        link["transport"] = draw.choice([{"kind": "udp"}, {"kind": "udp", "late": "deliver"}, tcp])
     if draw.random() < 0.2 and link["loss"]["kind"] in ("markov", "gilbert-elliott"):
         link |= {"clock": "time", "slot": draw.choice(("4 ms", "10 ms"))}
     return link
