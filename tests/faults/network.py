@@ -149,7 +149,11 @@ class DisturbedNetwork(MemoryNetwork):
     def _alive(self) -> list[DisturbedBus]:
         """Those of roles that are there, in the order of joining; not the orchestrator's."""
         there = {id(bus) for bus, _ in self._tokens}
-        return [bus for bus in self._buses if id(bus) in there and bus.role != ORCHESTRATOR and bus.kill is None]
+        return [
+            bus
+            for bus in self._buses
+            if id(bus) in there and bus.role != ORCHESTRATOR and not bus.left and bus.kill is None
+        ]
 
 
 class DisturbedBus(MemoryBus):
@@ -159,7 +163,8 @@ class DisturbedBus(MemoryBus):
         super().__init__(network)
         self._disturbed = network
         self.role = ""
-        self.dead = False
+        self.dead = self.left = False
+        """left: as it was told to; what it has to report is said at the end of the run."""
         self.kill: Kill | None = None
         self.steps_left: int | None = None
         """Messages that it may still publish; None: any number."""
@@ -177,7 +182,9 @@ class DisturbedBus(MemoryBus):
 
     def _answered(self, key: str, answer: Answer, question: bytes) -> bytes:
         try:
-            return answer(question)
+            told = answer(question)
+            self.left = self.left or b'"action":"leave"' in question
+            return told
         except _Died as died:
             self._disturbed.die(died.bus)
             raise BusError(f"nobody answers on {key}") from None
