@@ -25,6 +25,7 @@ from testbed.orchestrator.summary import Happened
 from testbed.orchestrator.timeline import Timeline
 from testbed.orchestrator.watchdog import Watchdog
 from testbed.plant.service import ROLE as PLANT
+from testbed.scenario import ClosedLoop
 from testbed.scenario.recovery import Policy
 from testbed.wire.begin import AT_START, Begin
 from testbed.wire.bus import Bus
@@ -124,7 +125,7 @@ class Conductor:
         self.services.watch, self.services.joins = self._watch, self._joins
         self.services.leaves, self.services.failed = self._leaves, self.fail
         self.recovery = Recovery(setup, self.collector, self.services, roles, dict(policies or {}))
-        self.recovery.forget = lambda step: self._order("forget", step)
+        self.recovery.forget = self._forget
         self.recovery.changes = lambda role: self.timeline.told_to(role.removeprefix("link."))
         self.recovery.missed, self.recovery.rejected = self._missed, self.node.rejected
         self.services.retry, self.services.comes_back = self._advance_soon, self._comes_back
@@ -133,6 +134,9 @@ class Conductor:
         """How a role's process has ended, if it has."""
         self.watchdog = Watchdog(setup, self.collector, lambda: self._order("ping"))
         self._gates: dict[str, Gate] = {}
+        source = setup.scenario.input
+        followed = [source.estimator] if setup.kept and isinstance(source, ClosedLoop) else []
+        self._remembered = {name: self.node.remember(self.node.keys.estimate(name)) for name in followed}
         self._subscribe()
         bus.answer(self.node.keys.begin, self._begin_of)
         bus.answer(self.node.keys.ask, self._asked)
@@ -472,6 +476,10 @@ class Conductor:
         elif self.started:
             self._advance()
 
+    def _forget(self, step: int) -> None:
+        self.node.forget(step)
+        self._order("forget", step)
+
     def _order(self, action: Literal["stop", "ping", "forget"], step: int | None = None) -> None:
         command = Command(run=self.setup.run, source=ORCHESTRATOR, seq=self._commands, action=action, step=step)
         self._commands += 1
@@ -545,6 +553,8 @@ class Conductor:
         self._collected("truth", packet, arrays)
 
     def _estimate(self, name: str, topic: str, packet: EstimateMessage, arrays: Arrays) -> None:
+        if name in self._remembered:
+            self._remembered[name](packet.seq)
         self.collector.estimate(name, packet.step, packet.lane, arrays)
         self._collected(topic, packet, arrays)
 
