@@ -59,14 +59,15 @@ class Whole:
     lives: dict[str, Life]
 
 
-class Logged(MemoryNetwork):
-    """Notes what is published."""
+def logged(network: type[MemoryNetwork], log: Messages) -> type[MemoryNetwork]:
+    """Such a network that notes what is published."""
 
-    log: Messages
+    class Logged(network):  # type: ignore[valid-type, misc]
+        def _publish(self, key: str, payload: bytes) -> None:
+            log.append((key, payload))
+            super()._publish(key, payload)
 
-    def _publish(self, key: str, payload: bytes) -> None:
-        self.log.append((key, payload))
-        super()._publish(key, payload)
+    return Logged
 
 
 class LateNode(Node):
@@ -109,7 +110,9 @@ def packets_of(messages: Messages, role: str, begin: int = 0) -> Messages:
     return out
 
 
-def whole_run(scenario: Scenario, out: Path, schedule: int | None = None) -> Whole:
+def whole_run(
+    scenario: Scenario, out: Path, schedule: int | None = None, network: type[MemoryNetwork] = MemoryNetwork
+) -> Whole:
     """A run in process in which every service gives its state after every step."""
     log: Messages = []
     lives: dict[str, Life] = {}
@@ -121,10 +124,6 @@ def whole_run(scenario: Scenario, out: Path, schedule: int | None = None) -> Who
 
         return born
 
-    class Network(Logged):
-        pass
-
-    Network.log = log
     joined, ask = service.builder, MemoryBus.ask
 
     def asked(bus: MemoryBus, key: str, question: bytes = b"") -> bytes:
@@ -134,7 +133,7 @@ def whole_run(scenario: Scenario, out: Path, schedule: int | None = None) -> Who
     with (
         patch.object(MemoryBus, "ask", asked),
         patch("testbed.orchestrator.report.write_report"),
-        patch("testbed.orchestrator.run.MemoryNetwork", Network),
+        patch("testbed.orchestrator.run.MemoryNetwork", logged(network, log)),
         patch("testbed.orchestrator.services.builder", lambda name, spec=None: wrapped(joined(name, spec))),
     ):
         run = Run(scenario, out)
@@ -153,21 +152,22 @@ def live(
     messages: Sequence[tuple[str, bytes]],
     begin: int = 0,
     states: dict[int, bytes] | None = None,
+    network: type[MemoryNetwork] = MemoryNetwork,
 ) -> Life:
     """A life of such a service alone, which is sent these messages; from the states after ``begin`` steps on.
 
     The questions among them are orders; those that were given after these steps are given again.
     """
-    network = Logged()
-    network.log = []
+    log: Messages = []
+    alone = logged(network, log)()
     node = LateNode.__new__(LateNode)
     node.passed_over = begin
-    Node.__init__(node, network.bus(), setup.run, role, setup.sizes)
+    Node.__init__(node, alone.bus(), setup.run, role, setup.sizes)
     again = Life(life.build)
     again.born(node, setup)
     for lane, state in (states or {}).items():
         again.service.resume(lane, begin, state)
-    send = partial(MemoryNetwork._publish, network)
+    send = partial(network._publish, alone)
     for key, payload in messages:
         if key == node.keys.handover(role):
             order = Order.model_validate_json(unbundle(payload)[0])
@@ -175,17 +175,19 @@ def live(
                 node.bus.ask(key, payload)
         elif header_of(payload)["source"] != role:
             send(key, payload)
-            network.run(lambda: False)
+            alone.run(lambda: False)
     assert not node.rejected, node.rejected
-    again.published = packets_of(network.log, role)
+    again.published = packets_of(log, role)
     return again
 
 
-def check_resumed(life: Life, setup: Setup, role: str, messages: Messages, begin: int) -> None:
+def check_resumed(
+    life: Life, setup: Setup, role: str, messages: Messages, begin: int, network: type[MemoryNetwork] = MemoryNetwork
+) -> None:
     """What goes on from the states after ``begin`` steps is, to the bit, what went on."""
     states = life.states[begin]
     assert states.keys() == dict(setup.blocks).keys()
-    again = live(life, setup, role, messages, begin, states)
+    again = live(life, setup, role, messages, begin, states, network)
     assert again.published == packets_of(life.published, role, begin)
     assert again.counters == life.counters
     for step, given in again.states.items():

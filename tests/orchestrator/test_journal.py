@@ -281,7 +281,7 @@ def test_a_checkpoint_needs_its_figures(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal")
     journal.begin(FACTS)
     journal.figures(3, b"")
-    with pytest.raises(ValueError, match="step 4 with figures up to 3"):
+    with pytest.raises(ValueError, match="step 4, and no figures end there"):
         journal.checkpoint(4, {}, b"", {})
     journal.close()
     (tmp_path / "journal" / "figures.bin").write_bytes(b"")

@@ -270,8 +270,8 @@ def test_real_time_begins_when_the_script_lets_it(tmp_path: Path) -> None:
     run(scenario(estimators=SPECS, clock=clock, events=events), tmp_path / "table")
     with start(tmp_path / "script", clock=clock) as live:
         live.at(9).set("control", loss="none")
-        with pytest.raises(UsageError, match="real time"):
-            live.swap("ff", to={"kind": "aoe"})
+        with pytest.raises(UsageError, match="clock mode 'real'"):
+            live.snapshot("ff")
         time.sleep(0.05)
         assert (live.completed, live.status()["status"]) == (0, "held")
         assert live.until(3).step == 3

@@ -7,11 +7,14 @@ from typing import Any
 
 import pytest
 
-from orchestrator.resuming import Whole, check_resumed, packets_of, whole_run
+from orchestrator.resuming import Whole, check_resumed, live, packets_of, whole_run
 from orchestrator.runs import MARKOV, scenario
 from orchestrator.test_late import LINKS as LATE
 from orchestrator.test_robust import scenario as robust
 from orchestrator.test_swaps import able, swap
+from orchestrator.wall_clock import Simulated
+from testbed.errors import UsageError
+from testbed.wire.state import pack
 
 STEPS = 20
 SPLIT = {"transport": {"lanes_per_packet": 4}}
@@ -109,3 +112,41 @@ def test_services_that_joined_go_on_under_the_names_that_they_have(tmp_path: Pat
     assert set(begins.values()) == {1, 4, 5, 13}
     assert set(ends.values()) == {3, 10, 12, STEPS}
     check(run, 1, 2, 4, 8, 9, 12, 14, 17)
+
+
+def in_real_time(tmp_path: Path, **changes: Any) -> Whole:
+    clock = {"mode": "real", "period": "10 ms"}
+    given = scenario(**GIVEN, **SPLIT, **changes, clock=clock, estimators=[{"name": "aoe", "acks": "none"}])
+    return whole_run(given, tmp_path, network=Simulated)
+
+
+def test_in_real_time_a_controller_without_feedback_sends_the_same(tmp_path: Path) -> None:
+    run = in_real_time(tmp_path)
+    for step in (1, 8, 19):
+        check_resumed(run.lives["controller"], run.setup, "controller", run.messages, step, network=Simulated)
+
+
+def test_in_real_time_a_controller_knows_again_what_it_knew(tmp_path: Path) -> None:
+    """What it sends then depends on when estimates come; its state says all that it knows."""
+    source = {"kind": "pid", "kp": 0.3, "ki": 0.1, "kd": 0.2, "high": 1.5, "estimator": "aoe"}
+    run = in_real_time(tmp_path, input=source)
+    life = run.lives["controller"]
+    for step in (1, 8, 19):
+        again = live(life, run.setup, "controller", [], step, life.states[step], Simulated)
+        assert {lane: again.service.state(lane) for lane in life.states[step]} == life.states[step]
+
+
+def test_a_controller_without_a_state_gives_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "stateless.py").write_text(
+        "class Plain:\n"
+        "    def __init__(self, model, lanes):\n        pass\n\n"
+        "    def step(self, k, x_hat, P):\n        return -0.1 * x_hat[:, :1]\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    source = {"kind": "python", "controller": "stateless:Plain", "estimator": "aoe"}
+    run = whole_run(scenario(**GIVEN, input=source, estimators=[{"name": "aoe", "acks": "none"}]), tmp_path / "out")
+    life = run.lives["controller"]
+    assert not life.service.gives_state
+    assert not life.states
+    with pytest.raises(UsageError, match="set_state"):
+        life.service.resume(0, 3, pack({}, step=3))

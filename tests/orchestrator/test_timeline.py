@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from orchestrator.wall_clock import MS, Simulated
 from testbed.errors import RunFailed, UsageError
 from testbed.estimator.snapshot import Snapshot
 from testbed.orchestrator.conductor import Conductor
+from testbed.orchestrator.processes import NoProcesses
 from testbed.orchestrator.summary import Happened, Summary
 from testbed.wire.bundle import unbundle
 
@@ -295,13 +297,11 @@ class Killer:
 def killers(monkeypatch: pytest.MonkeyPatch) -> list[Killer]:
     made: list[Killer] = []
 
-    class Killed(Conductor):
-        def __init__(self, *arguments: Any) -> None:
-            super().__init__(*arguments)
-            made.append(Killer(self))
-            self.timeline.processes = made[-1]
+    def in_place(_: Any, restart: Any) -> Killer:
+        made.append(Killer(restart.__self__))
+        return made[-1]
 
-    monkeypatch.setattr("testbed.orchestrator.run.Conductor", Killed)
+    monkeypatch.setattr("testbed.orchestrator.run.OneProcess", in_place)
     return made
 
 
@@ -324,10 +324,53 @@ def test_processes_are_ended_while_the_clock_stands_before_their_step(killers: l
     assert summary.events[-1].text == "restart link.ack: not done: link.ack would not end"
 
 
-def test_nobody_can_end_what_nobody_started(tmp_path: Path) -> None:
-    summary = run(scenario(estimators=AOE, events=[{"at": 8, "action": "kill", "role": "plant"}]), tmp_path)
-    assert [e.reason for e in summary.events] == ["nobody can kill plant in this run"]
-    assert summary.status == "complete"
+@pytest.mark.parametrize("end", ["kill", "restart"])
+def test_what_is_ended_is_recovered(end: str, tmp_path: Path) -> None:
+    summary = run(scenario(estimators=AOE, events=[{"at": 8, "action": end, "role": "plant"}]), tmp_path / "ended")
+    plain = run(scenario(estimators=AOE), tmp_path / "plain")
+    assert [(event.step, event.ok) for event in summary.events] == [(8, True)]
+    assert [(lost.role, lost.step) for lost in summary.recovered] == [("plant", 7)]
+    assert {**determined(summary), "recovered": (), "repeated": {}} == determined(plain)
+
+
+def test_a_pause_delays_and_changes_nothing(tmp_path: Path) -> None:
+    events = [{"at": 8, "action": "pause", "role": "plant", "for": "200 ms"}]
+    began = time.monotonic()
+    summary = run(scenario(estimators=AOE, events=events), tmp_path / "paused", 3)
+    assert time.monotonic() - began > 0.2
+    assert [(event.step, event.ok) for event in summary.events] == [(8, True)]
+    assert determined(summary) == determined(run(scenario(estimators=AOE), tmp_path / "plain"))
+
+
+def test_what_has_no_processes_ends_none() -> None:
+    for end in (lambda p: p.kill("plant"), lambda p: p.pause("plant", 1.0), lambda p: p.restart("plant")):
+        with pytest.raises(RunFailed, match=r"nobody can \w+ plant in this run"):
+            end(NoProcesses())
+
+
+ROLES = ("plant", "controller", "link.observation", "estimator.ff")
+
+
+@pytest.mark.parametrize("schedule", [None, 3])
+def test_what_roles_were_told_on_the_way_outlives_them(schedule: int | None, tmp_path: Path) -> None:
+    """They are told of drift, input and cuts once; a new process must know of it, to the same bits."""
+    events: list[dict[str, Any]] = [
+        {"when": "step == 5", "action": "plant", "A": [[0.6, 0.1], [0.0, 0.5]], "over": 8},
+        {"when": "step == 6", "action": "input", "input": {"kind": "uniform", "low": -2.0, "high": 9.0}},
+        {"when": "step == 7", "action": "partition", "links": ["observation"]},
+        {"when": "loss_rate(observation, last 6 steps) > 0.95", "action": "heal"},
+        {"at": 9, "action": "acks", "acks": "perfect", "estimator": "aoe"},
+    ]
+    kills = [{"at": at, "action": "kill", "role": role} for at, role in zip((8, 10, 12, 14), ROLES, strict=True)]
+    kept = run(scenario(estimators=AOE, events=events), tmp_path / "kept")
+    killed = run(scenario(estimators=AOE, events=[*events, *kills]), tmp_path / "killed", schedule)
+    assert [event.text for event in killed.events if not event.ok] == []
+    assert len(killed.events) == 9
+    assert of(killed, "heal")[0].true_at == of(kept, "heal")[0].true_at
+    left_out = ("recovered", "repeated")
+    assert {k: v for k, v in determined(killed).items() if k not in left_out} == {
+        k: v for k, v in determined(kept).items() if k not in left_out
+    }
 
 
 def test_in_real_time_events_come_when_their_step_is_due(

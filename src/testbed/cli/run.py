@@ -84,7 +84,10 @@ def resume(
     work, begun = Run.again(run, say=lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True))
     for line in begun.lost:
         console.print(f"damaged: {line}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"resuming after step {begun.step} of {begun.given.steps}", highlight=False)
+    if begun.anew:
+        console.print(f"beginning anew: {begun.anew}", markup=False, highlight=False, soft_wrap=True)
+    else:
+        console.print(f"resuming after step {begun.step} of {begun.given.steps}", highlight=False)
     with progress_display(console, begun.given.name, begun.given.steps, shown=not quiet) as display:
         work.shown_by(display.update, display.say)
         summary = work.in_process() if in_process else work.over_zenoh()

@@ -95,6 +95,8 @@ class Conductor:
         self.activity = 0
         """Grows with every message that was of use."""
         self.on_started: Callable[[], None] = lambda: None
+        self.on_present: Callable[[str], None] = lambda role: None
+        """Called with each role that comes while the run goes."""
         self.on_progress: Callable[[], None] = lambda: None
         """Called when all roles are there, when steps are complete, and when events are decided."""
         self.say: Callable[[str], None] = lambda line: None
@@ -497,6 +499,8 @@ class Conductor:
 
     def _presence(self, key: str, alive: bool) -> None:
         role = key.rsplit("/", 1)[1]
+        if alive and self.started:
+            self.on_present(role)
         if alive and self.services.here(role):
             self.activity += 1
             if self.started:

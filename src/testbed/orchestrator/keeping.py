@@ -31,6 +31,7 @@ class Keeper:
         self._flushed_s = time.monotonic()
         conductor.collector.on_completed = self._completed
         conductor.recovery.keep, conductor.recovery.stable = self._keep, lambda: journal.stable
+        conductor.recovery.all_give = True
         conductor.timeline.decided = conductor.services.decided = self._decided
         conductor.timeline.refused = conductor.services.refused = self._refused
 
@@ -45,7 +46,7 @@ class Keeper:
                 self._recorder.flush()
 
     def _completed(self, step: int) -> None:
-        if self._every and not step % self._every:
+        if self._every and not step % self._every and self._can_be(step):
             self._flush(step)
             self._collected[step] = self._conductor.collector.state(), facts_of(self._conductor, step)
 
@@ -53,10 +54,17 @@ class Keeper:
         if step > self._journal.figures_to:
             self._journal.figures(step, self._conductor.collector.figures(self._journal.figures_to, step))
 
-    def _keep(self, checkpoint: Checkpoint) -> None:
+    def _can_be(self, step: int) -> bool:
+        """Whether there can be a checkpoint of the whole run: not where a role gives no state."""
+        recovery = self._conductor.recovery
+        return not recovery.serving(step) & recovery.silent.keys()
+
+    def _keep(self, checkpoint: Checkpoint) -> bool:
         step = checkpoint.step
+        if not self._can_be(step):
+            return False
         if step <= self._offered or step not in self._collected or not self._is_all_there(step):
-            return
+            return True
         self._offered = step
         states = {(role, lane): data for role, by_lane in checkpoint.states.items() for lane, data in by_lane.items()}
         collector, facts = self._collected[step]
@@ -67,6 +75,7 @@ class Keeper:
             self._recorder.flush()
             sync = (self._recorder.fsync,)
         self._journal.checkpoint(step, states, collector, facts, *sync)
+        return True
 
     def _is_all_there(self, step: int) -> bool:
         """Whether the recording holds every packet up to a step, and who has left has reported."""

@@ -43,6 +43,27 @@ def policies_of(
     return out
 
 
+def silent_roles(
+    scenario: Scenario,
+    roles: Sequence[RoleSpec],
+    policies: Mapping[str, Policy],
+    external: Sequence[str] = (),
+    services: Mapping[str, EstimatorSpec] | None = None,
+) -> dict[str, str]:
+    """The roles that may give no state, and why. services: as for ``policies_of``.
+
+    What somebody starts by hand need not be the testbed's own, unless the scenario lets it be started anew.
+    """
+    specs = {role_of(spec.name): spec for spec in scenario.estimators} | dict(services or {})
+    out = {}
+    for role in roles:
+        if role.name in external and policies.get(role.name) != "restart":
+            out[role.name] = "it is started by hand"
+        elif (reason := unable(scenario, role.name, specs.get(role.name))) is not None:
+            out[role.name] = reason
+    return out
+
+
 def policy_of_service(scenario: Scenario, role: str, spec: EstimatorSpec) -> Policy:
     """Of an estimator's service that joins while the run goes."""
     return _policy(scenario, role_name(role), unable(scenario, role, spec), external=False)

@@ -15,7 +15,7 @@ from math import inf
 from testbed.errors import TestbedError, UsageError
 from testbed.estimator.service import role_of
 from testbed.orchestrator.collect import Collector
-from testbed.orchestrator.policies import policy_of_service
+from testbed.orchestrator.policies import policy_of_service, unable
 from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Services
 from testbed.orchestrator.summary import Recovered
@@ -55,8 +55,9 @@ class Recovery:
     """Policies, states and restarts.
 
     ``launch`` starts a role again, and ends what is left of its process; it may raise a TestbedError. ``forget`` is
-    called with the step of a new checkpoint. ``keep`` is given, before, what may become one, by who writes a journal;
-    ``stable`` says up to which step that is done. ``missed``: called with a role that the run goes on without.
+    called with the step of a new checkpoint. ``keep`` is given, before, what may become one, by who writes a journal,
+    and answers whether that keeps it; ``stable`` says up to which step it is done. ``missed``: called with a role that
+    the run goes on without.
     """
 
     def __init__(
@@ -73,10 +74,14 @@ class Recovery:
         self.launch: Callable[[RoleSpec], None] = _nobody
         self.missed: Callable[[str, int], None] = lambda role, last: None
         self.forget: Callable[[int], None] = lambda step: None
-        self.keep: Callable[[Checkpoint], None] = lambda checkpoint: None
+        self.keep: Callable[[Checkpoint], bool] = lambda checkpoint: False
         self.stable: Callable[[], float] = lambda: inf
         self.changes: Callable[[str], list[bytes]] = lambda role: []
         """The changes that a role was told of."""
+        self.silent: dict[str, str] = {}
+        """Roles that give no state, and why."""
+        self.all_give = False
+        """Whether a checkpoint is to hold the states of all roles, and not only of those that may be started anew."""
         self.happened: list[Recovered] = []
         self.down: dict[str, _Down] = {}
         self.checkpoint = Checkpoint(0)
@@ -159,6 +164,8 @@ class Recovery:
         self.specs[role.name] = role
         if self.policies:
             self.policies[role.name] = policy_of_service(self._setup.scenario, role.name, spec)
+        if (reason := unable(self._setup.scenario, role.name, spec)) is not None:
+            self.silent[role.name] = reason
 
     def served(self, role: str, order: Order) -> None:
         """A service was told something on its way that it is to be told again."""
@@ -186,8 +193,8 @@ class Recovery:
         whole = [step for step in self._coming if self._whole(step)]
         if not whole:
             return
-        self.keep(self._coming[max(whole)])
-        stable = self.stable()
+        newest = self._coming[max(whole)]
+        stable = self.stable() if self.keep(newest) else inf
         kept = max((step for step in whole if step <= stable), default=None)
         if kept is not None:
             self.checkpoint = self._coming[kept]
@@ -200,14 +207,17 @@ class Recovery:
             len(states.get(role, ())) == len(self._blocks) for role in self._givers(step)
         )
 
+    def serving(self, step: int) -> set[str]:
+        """The roles that take part in a step."""
+        estimators = {self._services.role_at(name, step) for name in self._services.turns}
+        return {role for role in self.specs if not role.startswith(_ESTIMATOR) or role in estimators}
+
     def _givers(self, step: int) -> set[str]:
-        """The roles that give a state at a step: those that are to be started anew if they are lost."""
-        serving = {self._services.role_at(name, step) for name in self._services.turns}
-        return {
-            role
-            for role in self.specs
-            if self.policies.get(role) == "restart" and (not role.startswith(_ESTIMATOR) or role in serving)
-        }
+        """The roles without whose states there is no checkpoint after a step."""
+        serving = self.serving(step)
+        if self.all_give:
+            return serving - self.silent.keys()
+        return {role for role in serving if self.policies.get(role) == "restart"}
 
 
 _ESTIMATOR = role_of("")

@@ -19,14 +19,16 @@ from testbed.orchestrator.journal import Found, read
 from testbed.orchestrator.recovery import Checkpoint
 from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Origin, Turn
-from testbed.orchestrator.summary import Downtime, Happened, Recovered
+from testbed.orchestrator.summary import Downtime, Happened, Recovered, read_summary
 from testbed.scenario import EstimatorSpec, Scenario, parse_scenario
 from testbed.wire.messages import Status
+from testbed.wire.node import ORCHESTRATOR
 
 if TYPE_CHECKING:
     from testbed.orchestrator.conductor import Conductor
 
-FOLDER = "journal"
+FOLDER, SUMMARY = "journal", "summary.json"
+_ENDED = {"failed": "failed", "interrupted": "was interrupted"}
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,8 @@ class Resumed:
     """A run that was begun. given: its scenario as it was; scenario: with what was commanded.
 
     origins: of the events that were commanded, by their place among all. refused: what was commanded and not done.
-    lost: what of the journal is damaged, a line each.
+    external: the roles that somebody starts by hand. before: each time that it was resumed before. lost: what of the
+    journal is damaged, a line each. anew: why it begins anew; empty: it goes on after ``step``.
     """
 
     run: str
@@ -44,7 +47,17 @@ class Resumed:
     found: Found
     origins: dict[int, Origin]
     refused: tuple[Happened, ...]
+    external: tuple[str, ...]
+    before: tuple[Recovered, ...]
     lost: tuple[str, ...]
+    anew: str
+
+    @property
+    def record(self) -> Recovered:
+        """What the summary says of it."""
+        figures = self.found.figures
+        done = figures[-1].to if figures else 0
+        return Recovered(role=ORCHESTRATOR, how="did not finish", step=done, policy="restart", begin=self.step)
 
 
 def facts_of(conductor: Conductor, step: int) -> dict[str, Any]:
@@ -72,7 +85,7 @@ def resumed(folder: Path) -> Resumed:
     """What a run's folder says of a run that was not finished. Raises UsageError where there is none."""
     path = folder / FOLDER
     if not path.is_dir():
-        raise UsageError(f"{folder}: no run to be resumed; allowed: the folder of a run that was not finished")
+        raise UsageError(f"{folder}: {_why_none(folder)}; allowed: the folder of a run that was not finished")
     found = read(path)
     try:
         given = parse_scenario(found.begin["scenario"], source=f"{path}: scenario")
@@ -84,6 +97,8 @@ def resumed(folder: Path) -> Resumed:
             for place, (number, note) in enumerate(sorted(commands.items()))
         }
         tables = [note["command"] for _, note in sorted(commands.items())]
+        external = tuple(map(str, found.begin["external"]))
+        before = tuple(Recovered.model_validate(note["resumed"]) for note in found.notes if "resumed" in note)
     except (KeyError, TypeError, ValueError) as error:
         raise UsageError(f"{path}: not the journal of a run: {' '.join(str(error).split())}") from None
     if given.clock.real:
@@ -91,9 +106,22 @@ def resumed(folder: Path) -> Resumed:
             f"{folder}: its run keeps real time, and what was due meanwhile cannot be made up; allowed: to begin anew"
         )
     scenario = _with_events(given, tables, path)
-    conditions = any(not event.timed for event in given.events)
-    step = 0 if conditions or found.checkpoint is None else found.checkpoint.step
-    return Resumed(run, given, scenario, step, found, origins, refused, found.lost)
+    step, anew = 0, ""
+    if any(not event.timed for event in given.events):
+        anew = "what its conditions have seen is in no checkpoint"
+    elif found.checkpoint is None:
+        anew = "there is no checkpoint of it"
+    else:
+        step = found.checkpoint.step
+    return Resumed(run, given, scenario, step, found, origins, refused, external, before, found.lost, anew)
+
+
+def _why_none(folder: Path) -> str:
+    try:
+        status = read_summary(folder / SUMMARY).status
+    except (OSError, UsageError):
+        return "no run to be resumed"
+    return "its run is complete" if status == "complete" else f"its run {_ENDED[status]}, and kept no journal"
 
 
 def _with_events(given: Scenario, tables: list[dict[str, Any]], path: Path) -> Scenario:
@@ -139,7 +167,9 @@ def go_on(conductor: Conductor, begun: Resumed) -> None:
     services.pending = [
         replace(entry, origin=begun.origins.get(entry.origin.number, entry.origin)) for entry in services.pending
     ]
+    recovered = conductor.recovery.happened
     if not step:
+        recovered += (*begun.before, begun.record)
         timeline.others += begun.refused
         return
     checkpoint = begun.found.checkpoint
@@ -158,7 +188,8 @@ def go_on(conductor: Conductor, begun: Resumed) -> None:
     known = {entry.number for entry in (*timeline.others, *services.happened) if not entry.ok}
     timeline.others += [entry for entry in begun.refused if entry.number not in known]
     timeline.begin_after(step)
-    conductor.recovery.happened = [Recovered.model_validate(entry) for entry in facts["recovered"]]
+    entries = [Recovered.model_validate(entry) for entry in facts["recovered"]]
+    recovered += (*(entry for entry in entries if entry.role != ORCHESTRATOR), *begun.before, begun.record)
     states: dict[str, dict[int, bytes]] = {}
     for (role, lane), data in checkpoint.states.items():
         states.setdefault(role, {})[lane] = data

@@ -26,7 +26,7 @@ from testbed.orchestrator.keeping import Keeper
 from testbed.orchestrator.lanes_file import NAME as LANES
 from testbed.orchestrator.lanes_file import LaneFigures, write_lanes
 from testbed.orchestrator.outcome import summarise, versions
-from testbed.orchestrator.policies import policies_of
+from testbed.orchestrator.policies import policies_of, silent_roles
 from testbed.orchestrator.preflight import check_parts, check_processes, prepare_folder
 from testbed.orchestrator.priority import Priorities
 from testbed.orchestrator.processes import OneProcess, OwnProcesses
@@ -38,7 +38,7 @@ from testbed.orchestrator.statistics import Progress
 from testbed.orchestrator.summary import Summary, Timing, write_summary
 from testbed.orchestrator.supervise import Supervisor, command_of
 from testbed.orchestrator.timeline import SNAPSHOTS
-from testbed.scenario import Scenario, to_toml
+from testbed.scenario import EstimatorSpec, Scenario, to_toml
 from testbed.scenario.recovery import Policy
 from testbed.wire.begin import Begin
 from testbed.wire.memory_bus import MemoryBus, MemoryNetwork
@@ -109,7 +109,7 @@ class Run:
 
     @np.errstate(all="ignore")  # what is not finite has no figure, and is counted
     def over_zenoh(self, external: Sequence[str] = ()) -> Summary:
-        """Across real processes; ``external`` names the roles that somebody starts by hand.
+        """Across real processes; ``external`` names the roles that somebody starts by hand, again where it goes on.
 
         Raises UsageError when the endpoint cannot be opened or an external role does not exist.
         """
@@ -117,6 +117,8 @@ class Run:
         from testbed.wire.zenoh_bus import ZenohBus
 
         names = [role.name for role in self._roles]
+        if self._begun is not None:
+            external = [role for role in self._begun.external if role in names]
         for name in external:
             if name not in names:
                 raise UsageError(
@@ -132,13 +134,13 @@ class Run:
             cleanup.enter_context(closing(session))
             if recorder is not None:
                 cleanup.callback(recorder.close)
-            journal = cleanup.enter_context(self._journal())
+            journal = cleanup.enter_context(self._journal(external))
             cleanup.callback(supervisor.close, 0.0)
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.express)
             bus.timed = self._setup.real
             self.desk.wake = lambda: bus.call(self.desk.work)
             cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
-            conductor = self._conductor(bus, recorder, policies, journal)
+            conductor = self._conductor(bus, recorder, policies, journal, external)
 
             def launch(role: RoleSpec) -> None:
                 if role.name in external:
@@ -174,6 +176,10 @@ class Run:
         Raises UsageError where a link needs real time and processes.
         """
         check_processes(self._setup.scenario)
+        if self._begun is not None and self._begun.external:
+            raise UsageError(
+                f"{', '.join(self._begun.external)}: started by hand in this run; allowed: to go on over processes"
+            )
         self._setup = replace(self._setup, single=True)
         policies = self._policies() if self._setup.snapshot_every else {}
         network = MemoryNetwork(schedule, timed=self._setup.real)
@@ -249,15 +255,27 @@ class Run:
             return self._finish(conductor, interrupted=interrupts.asked)
 
     def _policies(self, external: Sequence[str] = ()) -> dict[str, Policy]:
-        services = {} if self._begun is None else services_at(self._begun)
-        return policies_of(self._setup.scenario, self._roles, external, services)
+        return policies_of(self._setup.scenario, self._roles, external, self._services)
+
+    @property
+    def _services(self) -> dict[str, EstimatorSpec]:
+        """The estimators of roles that the scenario has not, where the run goes on."""
+        return {} if self._begun is None else services_at(self._begun)
 
     def _conductor(
-        self, bus: object, recorder: Recorder | None, policies: dict[str, Policy], journal: Journal | None
+        self,
+        bus: object,
+        recorder: Recorder | None,
+        policies: dict[str, Policy],
+        journal: Journal | None,
+        external: Sequence[str] = (),
     ) -> Conductor:
         begin = 0 if self._begun is None else self._begun.step
         conductor = Conductor(bus, self._setup, self._roles, recorder, policies, begin)  # type: ignore[arg-type]
         conductor.on_started, conductor.say = self._mark_start, self._say
+        if journal is not None:
+            silent = silent_roles(self._setup.scenario, self._roles, policies, external, self._services)
+            conductor.recovery.silent.update(silent)
         if self._begun is not None:
             go_on(conductor, self._begun)
         if journal is not None:
@@ -283,7 +301,10 @@ class Run:
             self._mark_start()
             priorities.raise_all({ORCHESTRATOR: os.getpid(), **pids()})
 
-        conductor.on_started = start
+        def rise(role: str) -> None:
+            priorities.raise_all({name: pid for name, pid in pids().items() if name == role})
+
+        conductor.on_started, conductor.on_present = start, rise
         try:
             yield
         finally:
@@ -301,7 +322,7 @@ class Run:
         )
 
     @contextmanager
-    def _journal(self) -> Iterator[Journal | None]:
+    def _journal(self, external: Sequence[str] = ()) -> Iterator[Journal | None]:
         """What lets the run be finished should this process die; it is removed when the run is complete."""
         wanted, folder = self._setup.scenario.recovery.journal, self._out / FOLDER
         if wanted is False or (wanted is None and self._setup.single) or self._setup.real:
@@ -310,9 +331,17 @@ class Run:
             return
         journal = Journal(folder)
         if self._begun is None:
-            journal.begin({"run": self._setup.run, "scenario": to_toml(self.scenario), "versions": versions()})
+            journal.begin(
+                {
+                    "run": self._setup.run,
+                    "scenario": to_toml(self.scenario),
+                    "external": list(external),
+                    "versions": versions(),
+                }
+            )
         else:
             journal.go_on(self._begun.step)
+            journal.note(resumed=self._begun.record.model_dump(mode="json"))
         try:
             yield journal
         finally:
@@ -378,12 +407,13 @@ class Run:
         now = time.monotonic()
         begun = self._started_s if self._started_s is not None else now
         wall = now - begun
-        completed, lanes = conductor.collector.completed, self._setup.scenario.lanes
+        lanes = self._setup.scenario.lanes
+        done = conductor.collector.completed - (0 if self._begun is None else self._begun.step)
         timing = Timing(
             wall_s=wall,
             startup_s=begun - self._begun_s,
-            steps_per_s=completed / wall if wall > 0 else None,
-            lane_steps_per_s=completed * lanes / wall if wall > 0 else None,
+            steps_per_s=done / wall if wall > 0 else None,
+            lane_steps_per_s=done * lanes / wall if wall > 0 else None,
             window=self._setup.window,
             swaps=conductor.services.swaps(),
         )

@@ -29,6 +29,8 @@ _LEAD_NS = 50_000_000
 _LEAD_STEPS = 3
 _PATIENCE_S = 1.0
 """So long after its step a service that has not begun is given up; the estimates are late until then."""
+_SPARE = 8
+"""Services that are started before the run begins, so many at most."""
 _WATCHED = 10
 """Estimates after a change whose lateness is told."""
 
@@ -75,8 +77,10 @@ class ServicesInTime(Services):
             self._listen(turns[0].role)
 
     def all_are_there(self) -> bool:
-        """Whether the services are there, or refused, that would be launched in the first moment of the run."""
-        self._launch_due(0, 0)
+        """Whether the services of the first changes are there, or refused; started later they take time from others."""
+        for entry in list(self.pending[:_SPARE]):
+            if entry.launched_s is None and self._needs_service(entry):
+                self._launch(entry, time.monotonic())
         return all(entry.present for entry in self.pending if entry.launched_s is not None)
 
     def deciding(self, role: str) -> bool:
@@ -123,8 +127,8 @@ class ServicesInTime(Services):
                 if role == affected.new or not self._is_handed(affected):
                     self._put_off(affected)
             return False
-        talk = self._talks.get(id(entry))
-        return super().lost(role, reason if talk is None else talk.given_up or reason)
+        own = self._talks.get(id(entry))
+        return super().lost(role, reason if own is None else own.given_up or reason)
 
     def give_up(self) -> None:
         """The run is over: what has not happened will not."""
