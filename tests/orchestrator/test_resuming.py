@@ -170,10 +170,29 @@ def test_what_was_commanded_happens_at_its_step_again(every: int, tmp_path: Path
             assert not cut_run(given, plain, -1, tmp_path / "none", meanwhile=order)
         whole = Summary.model_validate_json((plain / "summary.json").read_bytes())
         again, _ = resume(left)
-        same(plain, whole, left, again)
-        assert [(event.by, event.ok) for event in again.events] == [("command", True)] * decided
+        done_then = tuple(event for event in again.events if event.ok)
+        same(plain, whole, left, again.model_copy(update={"events": done_then}))
+        assert [event.by for event in done_then] == ["command"] * decided
+        assert len(again.events) == sum(at < cut for at in ORDERS)
         done.add(decided)
     assert len(done) >= 3
+
+
+def test_what_was_ordered_and_not_decided_yet_is_not_forgotten(tmp_path: Path) -> None:
+    """What has a step of its own happens then; of what has none it is said that it was not done."""
+    swap = {"action": "swap", "estimator": "aoe", "to": {"kind": "imm"}, "handover": "cold"}
+    given, left = journalled(), tmp_path / "left"
+    with patch.dict(ORDERS, {60: {**swap, "at": 17}, 199: swap}, clear=True):
+        assert cut_run(given, tmp_path / "cut", 200, left, settled=True, meanwhile=order)
+    again, step = resume(left)
+    assert 0 < step < 17
+    timed, untimed = sorted(again.events, key=lambda event: event.number or 0)
+    assert (timed.step, timed.by, timed.ok) == (17, "command", True)
+    assert (untimed.by, untimed.ok, untimed.reason) == ("command", False, "the run was cut off before it was decided")
+    with patch.dict(ORDERS, {60: {**swap, "at": 17}}, clear=True):
+        assert not cut_run(given, tmp_path / "plain", -1, tmp_path / "none", meanwhile=order)
+    whole = Summary.model_validate_json((tmp_path / "plain" / "summary.json").read_bytes())
+    same(tmp_path / "plain", whole, left, again.model_copy(update={"events": (timed,)}))
 
 
 def test_a_run_is_resumed_more_than_once(tmp_path: Path) -> None:
