@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import codec, estimators, fidelity, lanes, links, lockstep, realtime, streaming
+from benchmarks import codec, estimators, fidelity, journal, lanes, links, lockstep, realtime, streaming
 from benchmarks.figures import machine
 
 BENCHMARKS = {
@@ -24,6 +24,7 @@ BENCHMARKS = {
     "estimators": estimators.run,
     "links": links.run,
     "realtime": realtime.run,
+    "journal": journal.run,
     "fidelity": fidelity.run,
 }
 
