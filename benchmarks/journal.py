@@ -16,15 +16,15 @@ _RECOVERY: dict[str, dict[str, Any]] = {
     JOURNAL: {"policy": "restart", "journal": True},
 }
 _STEPS = {  # (lanes, in process) → steps
-    (1, False): 24_000,
-    (1, True): 24_000,
-    (10_000, False): 1_000,
-    (10_000, True): 1_000,
+    (1, False): 8_000,
+    (1, True): 8_000,
+    (10_000, False): 200,
+    (10_000, True): 200,
 }
 
 
 def run(*, quick: bool) -> Figures:
-    repetitions, share = (2, 4) if quick else (7, 1)
+    repetitions, share = (3, 2) if quick else (7, 1)
     figures = Figures("journal")
     for (lanes, in_process), steps in _STEPS.items():
         results = alternate(repetitions, {kept: _case(kept, lanes, in_process, steps // share) for kept in _RECOVERY})
