@@ -185,7 +185,15 @@ class ClosedLoopService:
         self._send_ready()
 
     def _send_ready(self) -> None:
-        for lane, ready in self._ready.items():
-            while ready and ready[0][0] < self._granted:
-                k, u = ready.popleft()
-                self._send(k, lane, len(u), {"u": u})
+        """Step by step, and block by block in each: so every role sends and takes its packets in one order.
+
+        What is sent again after a restart has the numbers that it had before.
+        """
+        granted = [(ready[0][0], lane) for lane, ready in self._ready.items() if ready and ready[0][0] < self._granted]
+        while granted:
+            k, lane = min(granted)
+            _, u = self._ready[lane].popleft()
+            self._send(k, lane, len(u), {"u": u})
+            granted.remove((k, lane))
+            if self._ready[lane] and self._ready[lane][0][0] < self._granted:
+                granted.append((self._ready[lane][0][0], lane))

@@ -68,6 +68,10 @@ class Keys:
         """Ask the sender on ``key`` here for what it has sent since a number."""
         return f"{self.prefix}/history/{key[len(self.prefix) + 1 :]}"
 
+    def earlier(self, key: str) -> str:
+        """Ask the orchestrator here for what it has taken on ``key``, also from senders that have left, as above."""
+        return f"{self.prefix}/earlier/{key[len(self.prefix) + 1 :]}"
+
     @property
     def begin(self) -> str:
         """Ask the orchestrator here, with the name of a role, where it begins."""

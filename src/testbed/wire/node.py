@@ -111,7 +111,8 @@ class Node:
         self._blocks = _blocks(sizes.lanes, sizes)
         self._from = Gate(begin.step) if begin.step else OPEN
         self._every, self._service = every, _NO_SERVICE
-        self._keeps, self._sent = frozenset(kept), dict[str, deque[tuple[int, bytes]]]()
+        self._keeps, self._sent = frozenset(kept), dict[str, _Kept]()
+        self._forgotten = 0
         self._inputs: dict[str, _Input] = {}
         self._held: list[tuple[_Input, bytes]] | None = [] if begin.late else None
         self._status_seq = 0
@@ -130,7 +131,7 @@ class Node:
         """
         encoder = PacketEncoder(model, self.run, self.name)
         gate = self._from if gate is OPEN else gate
-        kept = self._keep(key) if key in self._keeps else None
+        kept = self._keep(key, gate) if key in self._keeps else None
         send = _numbered(self.bus.publisher(key, lazy=lazy), encoder, gate, self._blocks, kept)
         if not tap or not self._tap or self._tap >= self.sizes.lanes:
             return send
@@ -180,7 +181,7 @@ class Node:
             first = 0 if gate.passed_over == 0 else None
         elif self.begin.late:
             first = 0 if model is Change else None
-        due = self._inputs[key] = _Input(key, first, of_changes=model is Change)
+        due = self._inputs[key] = _Input(key, first, of_changes=model is Change, turns_change=callable(source))
         blocks = _blocks(self._tap, self.sizes) if cut else None
 
         def receive(payload: bytes) -> None:
@@ -270,32 +271,54 @@ class Node:
         """What the sender on a key has sent since this role's beginning; nothing where nobody keeps it."""
         if due.key not in self._keeps:
             return []
-        since = self.begin.step * self._blocks
-        with suppress(BusError):
-            answer = self.bus.ask(self.keys.history(due.key), json.dumps({"since": since}).encode())
-            if answer[:1] == b"{":
-                raise RunFailed(f"{due.key}: {json.loads(answer)['error']}")
-            return [answer] if answer else []
-        return []
+        question = json.dumps({"since": self.begin.step * self._blocks}).encode()
+        told: list[bytes] = []
+        for key in (self.keys.history(due.key), *([self.keys.earlier(due.key)] if due.turns_change else ())):
+            with suppress(BusError):
+                answer = self.bus.ask(key, question)
+                if answer[:1] == b"{":
+                    raise RunFailed(f"{due.key}: {json.loads(answer)['error']}")
+                if answer:
+                    told.insert(0, answer)
+        return told
 
     def _work_off(self, told: list[tuple[_Input, bytes]]) -> None:
         held, self._held = self._held or [], None
         for due, payload in [*told, *held]:
             due.receive(payload)
 
-    def _keep(self, key: str) -> deque[tuple[int, bytes]]:
+    def _keep(self, key: str, gate: Gate) -> _Kept:
+        """What goes out on a key; it can be asked for once it is known from where on that is this role's."""
         if key not in self._sent:
-            self._sent[key] = deque()
-            self.bus.answer(self.keys.history(key), partial(self._told, self._sent[key]))
+            sent = self._sent[key] = _Kept()
+            sent.answered = partial(self.bus.answer, self.keys.history(key), partial(self._told, sent))
+            if gate.passed_over is not None:
+                sent.offer()
         return self._sent[key]
 
-    def _told(self, sent: deque[tuple[int, bytes]], question: bytes) -> bytes:
+    def remember(self, key: str) -> Callable[[int], None]:
+        """Keep what is taken on a key on which senders take turns; the function that does so with a number.
+
+        To be called while the message is handled.
+        """
+        taken = self._sent[key] = _Kept()
+        self.bus.answer(self.keys.earlier(key), partial(self._told, taken))
+        return lambda seq: taken.append((seq, self.payload))
+
+    def forget(self, step: int) -> None:
+        """Nobody will ask for what belongs to the first so many steps."""
+        self._forgotten = step * self._blocks
+        for sent in self._sent.values():
+            while sent and sent[0][0] < self._forgotten:
+                sent.popleft()
+
+    def _told(self, sent: _Kept, question: bytes) -> bytes:
         try:
             since = int(json.loads(question)["since"])
         except (ValueError, KeyError, TypeError):
             return json.dumps({"error": "a question that is not understood"}).encode()
-        if sent and sent[0][0] > since:
-            return json.dumps({"error": f"kept from number {sent[0][0]} on, asked for {since}"}).encode()
+        if since < self._forgotten:
+            return json.dumps({"error": f"kept from number {self._forgotten} on, asked for {since}"}).encode()
         messages = [message for seq, message in sent if seq >= since]
         return bundle(messages) if messages else b""
 
@@ -328,17 +351,25 @@ class Node:
         elif command.action == "ping":
             self.report("alive", {})
         else:
-            before = (command.step or 0) * self._blocks
-            for sent in self._sent.values():
-                while sent and sent[0][0] < before:
-                    sent.popleft()
+            self.forget(command.step or 0)
+
+
+class _Kept(deque[tuple[int, bytes]]):
+    """Messages with their numbers; ``offer``: they can be asked for from now on."""
+
+    answered: Callable[[], None] | None = None
+
+    def offer(self) -> None:
+        if self.answered is not None:
+            self.answered()
+            self.answered = None
 
 
 class _Input:
     """What is due on a key that a role listens to: the number of the next message, None until the first has come."""
 
-    def __init__(self, key: str, number: int | None, *, of_changes: bool) -> None:
-        self.key, self.number, self.of_changes = key, number, of_changes
+    def __init__(self, key: str, number: int | None, *, of_changes: bool, turns_change: bool) -> None:
+        self.key, self.number, self.of_changes, self.turns_change = key, number, of_changes, turns_change
         self.receive: Callable[[bytes], None] = lambda payload: None
 
 
@@ -398,9 +429,7 @@ def _blocks(lanes: int, sizes: Sizes) -> int:
     return -(-lanes // (sizes.lanes_per_packet or sizes.lanes))
 
 
-def _numbered(
-    publish: Publish, encoder: PacketEncoder, gate: Gate, blocks: int, kept: deque[tuple[int, bytes]] | None
-) -> Send:
+def _numbered(publish: Publish, encoder: PacketEncoder, gate: Gate, blocks: int, kept: _Kept | None) -> Send:
     seq = 0 if gate.passed_over == 0 else -1
 
     def send(step: int, lane: int, lanes: int, arrays: Arrays) -> None:
@@ -410,6 +439,7 @@ def _numbered(
         message = encoder.encode(seq, step, lane, lanes, arrays)
         if kept is not None:
             kept.append((seq, message))
+            kept.offer()
         publish(message)
         seq += 1
 
