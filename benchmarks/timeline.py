@@ -68,4 +68,4 @@ def _until_on_time(summary: dict[str, Any], name: str, step: int) -> int:
     times = summary["realtime"]["stages"][f"estimate/{name}"]["published_us"][step - 1 :]
     deadline = summary["realtime"]["deadline_us"]
     late = [time is not None and time > deadline for time in times]
-    return next(k for k in range(len(late)) if not any(late[k : k + _WATCHED]))
+    return next((k for k in range(len(late)) if not any(late[k : k + _WATCHED])), len(late))
