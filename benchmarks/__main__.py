@@ -13,7 +13,19 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import codec, estimators, fidelity, lanes, links, lockstep, realtime, streaming
+from benchmarks import (
+    codec,
+    estimators,
+    fidelity,
+    journal,
+    lanes,
+    links,
+    lockstep,
+    realtime,
+    recovery,
+    streaming,
+    timeline,
+)
 from benchmarks.figures import machine
 
 BENCHMARKS = {
@@ -24,6 +36,9 @@ BENCHMARKS = {
     "estimators": estimators.run,
     "links": links.run,
     "realtime": realtime.run,
+    "timeline": timeline.run,
+    "recovery": recovery.run,
+    "journal": journal.run,
     "fidelity": fidelity.run,
 }
 

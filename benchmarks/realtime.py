@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
-import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 from benchmarks.figures import Figures, Median, alternate
 from benchmarks.scenarios import scenario
-from testbed.scenario import to_toml
+from benchmarks.summaries import summary_of
 
 RATES_HZ = (100, 500, 1000)
 PRIORITY = 10
@@ -55,14 +50,7 @@ def _testbed(rate: int, seconds: float, priority: int | None) -> dict[str, Any] 
         {"priority": priority} if priority else {}
     )
     given = given.model_copy(update={"clock": type(given.clock).model_validate(clock)})
-    with tempfile.TemporaryDirectory(prefix="testbed-benchmark-") as folder:
-        path, out = Path(folder) / "scenario.toml", Path(folder) / "out"
-        path.write_text(to_toml(given))
-        command = [sys.executable, "-m", "testbed", "run", str(path), "--out", str(out), "--quiet"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise RuntimeError(f"the run failed: {done.stderr[-1500:]}")
-        realtime = json.loads((out / "summary.json").read_text())["realtime"]
+    realtime = summary_of(given)["realtime"]
     if priority and not realtime["priorities"]:
         return None
     stages = {"control leaves": "control/sent", "estimate is there": "estimate/aoe"}

@@ -30,6 +30,8 @@ class Result:
     cpu: Usage
     others: float
     """CPUs that the rest of the machine kept busy meanwhile."""
+    journal_bytes: int = 0
+    """On disk when the last step was complete."""
 
     @property
     def steps_per_s(self) -> float:
@@ -61,7 +63,8 @@ def run_testbed(scenario: object, *, in_process: bool = False) -> Result:
 class _Meter:
     """Takes the CPU times at the first and at the last completed step."""
 
-    def __init__(self) -> None:
+    def __init__(self, journal: Path) -> None:
+        self._journal, self.journal_bytes = journal, 0
         self._busy: Busy | None = None
         self._processes: dict[int, str] = {}
         self._before: Usage = {}
@@ -75,6 +78,7 @@ class _Meter:
         elif completed == steps:
             self.cpu = difference(usage_of(self._processes), self._before)
             self.others = self._busy.others(sum(sum(parts.values()) for parts in self.cpu.values()))
+            self.journal_bytes = sum(path.stat().st_size for path in self._journal.rglob("*") if path.is_file())
 
 
 def _role(pid: int) -> str:
@@ -96,7 +100,7 @@ def main() -> int:
     options.add_argument("out", type=Path)
     options.add_argument("--in-process", action="store_true")
     given = options.parse_args()
-    meter = _Meter()
+    meter = _Meter(given.out / "journal")
     run = Run(load_scenario(given.scenario), given.out, progress=meter.progress)
     summary = run.in_process() if given.in_process else run.over_zenoh()
     if summary.status != "complete":
@@ -104,7 +108,8 @@ def main() -> int:
         return 1
     timing = summary.timing
     figures = {"steps": summary.steps, "lanes": summary.lanes, "window": timing.window, "wall_s": timing.wall_s}
-    print(json.dumps({**figures, "cpu": meter.cpu, "others": meter.others}))
+    found = {"cpu": meter.cpu, "others": meter.others, "journal_bytes": meter.journal_bytes}
+    print(json.dumps(figures | found))
     return 0
 
 

@@ -238,12 +238,6 @@ def test_services_that_are_lost_around_changes_come_back(role: str, place: int, 
     if all(event.ok for event in there.events):
         then = run(virtual(events=as_it_was(there), **given), tmp_path / "virtual")
         assert figures(there) == figures(then)
-    print(
-        "PUT",
-        [(e.step, e.due) for e in there.events if e.due],
-        [e.reason for e in there.events if not e.ok],
-        [r.step for r in there.recovered],
-    )
     assert once_each(tmp_path / "real", there)
 
 

@@ -107,6 +107,8 @@ class EstimatorService:
         for order, data in node.begin.orders:
             if order.action == "take":
                 self._ordered(order, data)
+            elif order.action == "leave":
+                self.until = min(self.until, order.step)
             elif order.name is not None:
                 self.serve(order.name, order.step)
 

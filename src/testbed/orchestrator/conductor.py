@@ -343,6 +343,9 @@ class Conductor:
 
     def _lost(self, role: str, reason: str) -> bool:
         """Whether a role that is lost is of no consequence but for the change that it was to make."""
+        if role in self._gone and role not in self.reports and self.services.awaited(role):
+            self._gone.remove(role)
+            self._roles.append(role)
         if role in self._gone or role in self.services.unwanted:
             return True
         if not self.services.lost(role, reason):

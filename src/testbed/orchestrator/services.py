@@ -115,6 +115,11 @@ class Services:
             return None
         return next((turn.role for turn in reversed(turns) if turn.first <= step), None)
 
+    def awaited(self, role: str) -> bool:
+        """Whether a role that was told to leave, and that nobody follows, still has estimates to give."""
+        done = self._collector.estimated
+        return any(turns[-1].role == role and self.last[name] > done for name, turns in self.turns.items())
+
     def limit(self, steps: int) -> int:
         """The last step that the clock may grant now."""
         return min([steps, *(p.step - 1 for p in self.pending if p.step is not None)])

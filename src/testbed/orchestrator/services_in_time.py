@@ -254,6 +254,7 @@ class ServicesInTime(Services):
         del self._talks[id(talk.entry)]
         assert talk.old is not None
         self.leaves(talk.old)
+        self.served(talk.old, Order(action="leave", step=talk.step - 1))
         self._count_on(talk.entry, talk.step)
         self._settle(talk.entry, talk.step, 0)
 
