@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from faults.observed import Observed
-from testbed.orchestrator.summary import Summary
+from testbed.orchestrator.summary import EstimatorFigures, Summary
 
 Table = dict[str, Any]
+ENDS = ("kill", "restart")
+"""Events that end a process."""
 INCIDENTAL = {"timing", "recovered", "repeated", "rejected"}
 """What faults may change in a summary."""
 
@@ -41,7 +43,10 @@ class Outcome:
 
 
 def determined(summary: Summary, but: set[str]) -> Table:
-    return summary.model_dump(exclude=but)
+    table = summary.model_dump(exclude=but)
+    if "events" in table:
+        table["events"] = [event for event in table["events"] if event["action"] not in ENDS]
+    return table
 
 
 def findings(plain: Outcome, disturbed: Outcome, recovery: Table) -> list[str]:
@@ -53,6 +58,11 @@ def findings(plain: Outcome, disturbed: Outcome, recovery: Table) -> list[str]:
     if summary.status == "complete":
         return [*out, *_same(plain, disturbed)]
     return [*out, *_explained(summary, disturbed.killed, recovery), *_same_beginning(plain, disturbed)]
+
+
+def _last(figures: EstimatorFigures, summary: Summary) -> int:
+    """The last complete step at which an estimator was there."""
+    return summary.completed_steps if figures.until is None else min(figures.until, summary.completed_steps)
 
 
 def _books(summary: Summary) -> Iterator[str]:
@@ -68,7 +78,7 @@ def _books(summary: Summary) -> Iterator[str]:
 def _finite(summary: Summary) -> Iterator[str]:
     """A figure that is not finite is null in a summary: each step of an estimator that was there has its figures."""
     for name, figures in summary.estimators.items():
-        last = min(figures.until or summary.steps, summary.completed_steps)
+        last = _last(figures, summary)
         for what in ("trace_P_mean", "squared_error_mean"):
             values = getattr(figures, what)[max(0, figures.since - 1) : last]
             if any(value is None or not math.isfinite(value) for value in values):
@@ -81,7 +91,7 @@ def _counted(summary: Summary, observed: Observed) -> Iterator[str]:
     """Every step and block of lanes has exactly one estimate of each estimator that is there then."""
     lanes = sorted({lane for _, _, lane in observed.estimates})
     for name, figures in summary.estimators.items():
-        for step in range(max(1, figures.since), min(figures.until or summary.steps, summary.completed_steps) + 1):
+        for step in range(max(1, figures.since), _last(figures, summary) + 1):
             for lane in lanes:
                 times = observed.estimates[name, step, lane]
                 if times != 1:
