@@ -23,7 +23,10 @@ Table = dict[str, Any]
 
 @dataclass
 class Trial:
-    """table: the scenario; recovery: its table [recovery]; ends: events that end processes; faults: what else happens; schedule: order of delivery."""
+    """table: the scenario; recovery: its table [recovery]; ends: events that end processes; faults: what else happens.
+
+    schedule: the order of delivery; None: over processes.
+    """
 
     seed: int
     table: Table

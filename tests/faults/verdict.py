@@ -121,11 +121,16 @@ def _same(plain: Outcome, disturbed: Outcome) -> Iterator[str]:
 
 def _explained(summary: Summary, killed: list[str], recovery: Table) -> Iterator[str]:
     """A run that has failed says who was lost, and could not go on."""
+    killed = [*killed, *(lost.role for lost in summary.recovered)]
     role = next((role for role in killed if summary.reason is not None and summary.reason.startswith(role)), None)
     if summary.status != "failed" or role is None:
         yield f"{summary.status}: {summary.reason}"
-    elif recovery.get("policy") != "fail" and killed.count(role) <= recovery["restarts"]:
+    elif recovery.get("policy") != "fail" and _restarts(summary, role) < recovery["restarts"]:
         yield f"failed although {role} could be started anew: {summary.reason}"
+
+
+def _restarts(summary: Summary, role: str) -> int:
+    return sum(lost.role == role for lost in summary.recovered)
 
 
 def _same_beginning(plain: Outcome, disturbed: Outcome) -> Iterator[str]:
