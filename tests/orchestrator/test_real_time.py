@@ -281,11 +281,17 @@ def test_the_estimator_learns_u_as_it_was_sent(tmp_path: Path) -> None:
     assert np.array_equal(first["estimate/aoe"]["x_hat"], then["estimate/aoe"]["x_hat"])
 
 
-def test_links_that_keep_the_pace_themselves_are_refused(tmp_path: Path) -> None:
-    links = {"observation": {"backend": "relay"}}
-    with pytest.raises(UsageError) as refusal:
-        Run(one_lane(links=links), tmp_path).over_zenoh()
-    assert str(refusal.value) == (
-        "clock.mode: got 'real' with links.observation.backend 'relay', which keeps the pace itself; "
-        "allowed: virtual, or backend 'model'"
-    )
+def test_real_links_must_leave_time_for_an_estimate(tmp_path: Path) -> None:
+    for links, text in (
+        ({"observation": {"backend": "relay"}}, "links.observation.deadline: got 10 ms"),
+        (
+            {"control": {"backend": "relay", "deadline": "4 ms"}, "observation": {"backend": "relay"}},
+            "links.control.deadline + links.observation.deadline: got 14 ms",
+        ),
+    ):
+        with pytest.raises(UsageError) as refusal:
+            Run(one_lane(links=links), tmp_path).over_zenoh()
+        assert str(refusal.value) == (
+            f"{text} with clock mode 'real'; allowed: less than clock.deadline, 10 ms, for the loss of a packet is "
+            "known at its deadline"
+        )

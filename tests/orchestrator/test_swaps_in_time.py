@@ -205,3 +205,47 @@ def test_by_command_a_change_is_made_as_soon_as_all_can_know(tmp_path: Path) -> 
     plain = run(real(steps=100), tmp_path / "plain", network=Simulated)
     for name in ("aoe", "kfio"):
         assert plain.estimators[name] == summary.estimators[name]
+
+
+def losing(role: str, place: int) -> type[Simulated]:
+    """A network on which a role is lost when the truth of step ``place`` + 1 is there."""
+
+    class Losing(Simulated):
+        def before(self, key: str, number: int) -> bool:
+            if key == "truth" and number == place:
+                self.timers.at(self.clock.now_ns, self.close)
+            return True
+
+        def close(self) -> None:
+            for bus, token in list(self._tokens):
+                if token.endswith(f"presence/{role}"):
+                    bus.close()
+
+    return Losing
+
+
+def as_it_was(summary: Summary) -> list[dict[str, Any]]:
+    steps = {event.number: event.step for event in summary.events}
+    return [event | {"at": steps[number]} for number, event in enumerate(TIMELINE)]
+
+
+@pytest.mark.parametrize("place", [8, 13, 19])
+@pytest.mark.parametrize("role", ["aoe", "aoe.2", "next"])
+def test_services_that_are_lost_around_changes_come_back(role: str, place: int, tmp_path: Path) -> None:
+    given = {"recovery": {"every": 4, "restarts": 100}, "transport": {"lanes_per_packet": 4}}
+    there = run(real(events=TIMELINE, **given), tmp_path / "real", place, losing(f"estimator.{role}", place))
+    assert (there.status, there.rejected) == ("complete", {})
+    if all(event.ok for event in there.events):
+        then = run(virtual(events=as_it_was(there), **given), tmp_path / "virtual")
+        assert figures(there) == figures(then)
+    print(
+        "PUT",
+        [(e.step, e.due) for e in there.events if e.due],
+        [e.reason for e in there.events if not e.ok],
+        [r.step for r in there.recovered],
+    )
+    assert once_each(tmp_path / "real", there)
+
+
+def figures(summary: Summary) -> Any:
+    return {name: value.model_dump() for name, value in summary.estimators.items()}

@@ -15,6 +15,7 @@ from orchestrator.runs import SYSTEM, figures, recorded, run, scenario
 from orchestrator.wall_clock import MS, Simulated
 from testbed.errors import RunFailed, UsageError
 from testbed.estimator.snapshot import Snapshot
+from testbed.orchestrator.asked import status_of
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.processes import NoProcesses
 from testbed.orchestrator.summary import Happened, Summary
@@ -441,7 +442,7 @@ def test_the_clock_is_held_until_it_is_released(tmp_path: Path, monkeypatch: pyt
             if self.collector.completed == 2 and self.timeline.held_at is None and not held:
                 self.hold(8)
             if self.collector.completed == 8 and self.timeline.held_at == 8:
-                held.append((self._granted, self.status()["held"]))
+                held.append((self._granted, status_of(self)["held"]))
                 self.order({"action": "swap", "estimator": "ff", "to": {"kind": "imm"}, "at": 9})
                 self.release()
 

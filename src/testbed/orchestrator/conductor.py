@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from testbed.channel.service import role_of as link_role
 from testbed.control.service import ROLE as CONTROLLER
 from testbed.errors import UsageError, did_you_mean
 from testbed.estimator.bounds_service import ROLE as BOUNDS
+from testbed.orchestrator.asked import answer
 from testbed.orchestrator.collect import Collector
 from testbed.orchestrator.pacing import Pacing
 from testbed.orchestrator.recorder import Recorder
@@ -55,18 +54,6 @@ _LINKS: dict[LinkName, tuple[type[Packet], str]] = {
     "ack": (Acknowledgement, PLANT),
 }
 """What goes over a link, and who sends it."""
-
-
-class Asked(BaseModel):
-    """What somebody asks of a run that goes: to change a link, an event, to hold the clock, how it is, or to stop."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    link: str | None = None
-    set: dict[str, Any] | None = None
-    event: dict[str, Any] | None = None
-    do: Literal["status", "stop", "hold", "release"] | None = None
-    step: Annotated[int, Field(ge=0)] | None = None
 
 
 class Conductor:
@@ -139,7 +126,7 @@ class Conductor:
         self._remembered = {name: self.node.remember(self.node.keys.estimate(name)) for name in followed}
         self._subscribe()
         bus.answer(self.node.keys.begin, self._begin_of)
-        bus.answer(self.node.keys.ask, self._asked)
+        bus.answer(self.node.keys.ask, partial(answer, self))
         bus.answer(self.node.keys.scenario, lambda _: setup.to_json())
         self.node.announce()
         bus.watch(self.node.keys.presence("*"), self._presence)
@@ -246,47 +233,6 @@ class Conductor:
     def _check_going(self) -> None:
         if self.over or self._granted >= self._steps:
             raise UsageError("the run has no step left that could change")
-
-    def _asked(self, question: bytes) -> bytes:
-        """Answer what somebody asks of the run: {"link": …, "set": {…}}; with {"step": k}, or {"error": …}.
-
-        {"event": {…}} is an event as in a scenario; with {"number": n}. {"do": "hold", "step": k}, {"do": "release"},
-        {"do": "status"} and {"do": "stop"}; with status.
-        """
-        try:
-            asked = Asked.model_validate_json(question)
-            if asked.event is not None:
-                return json.dumps({"number": self.order(asked.event)}).encode()
-            if asked.do == "stop":
-                self.end("stopped by command")
-            elif asked.do == "hold":
-                self.hold(asked.step if asked.step is not None else self._granted)
-            elif asked.do == "release":
-                self.release()
-            if asked.do is not None:
-                return json.dumps(self.status()).encode()
-            return json.dumps({"step": self.change_link(asked.link or "", asked.set or {})}).encode()
-        except (UsageError, ValidationError) as error:
-            return json.dumps({"error": " ".join(str(error).split())}).encode()
-
-    def status(self) -> dict[str, Any]:
-        """How far the run is, who estimates, and what has happened."""
-        at = self._granted
-        future = [e for e in self.timeline.happened(self._steps) if e.step > at + 1 and e.by != "timeline"]
-        roles = {name: self.services.role_at(name, max(at, 1)) for name in self.services.turns}
-        return {
-            "completed": self.collector.completed,
-            "granted": at,
-            "steps": self._steps,
-            "estimators": {
-                name: {"role": role, "kind": next(t.spec.kind for t in self.services.turns[name] if t.role == role)}
-                for name, role in roles.items()
-                if role is not None
-            },
-            "held": self.timeline.held_at,
-            "pending": sorted(self.timeline.numbers | {e.number for e in future if e.number is not None}),
-            "events": [event.model_dump(mode="json", exclude_none=True) for event in self.timeline.happened(at + 1)],
-        }
 
     @property
     def happened(self) -> list[Happened]:

@@ -32,6 +32,7 @@ class Keeper:
         conductor.collector.on_completed = self._completed
         conductor.recovery.keep, conductor.recovery.stable = self._keep, lambda: journal.stable
         conductor.recovery.all_give = True
+        conductor.timeline.accepted = self._accepted
         conductor.timeline.decided = conductor.services.decided = self._decided
         conductor.timeline.refused = conductor.services.refused = self._refused
 
@@ -85,6 +86,10 @@ class Keeper:
         return recorder is None or all(
             recorder.holds(step, topic, lane) for topic in self._conductor.recorded for lane, _ in blocks
         )
+
+    def _accepted(self, event: Any, number: int, timed: bool) -> None:
+        table = event.model_dump(mode="json", exclude_none=True, by_alias=True)
+        self._journal.note(ordered=table, number=number, timed=timed)
 
     def _decided(self, event: Any, origin: Origin, step: int) -> None:
         if origin.number >= self._events:

@@ -85,9 +85,9 @@ def unable(scenario: Scenario, role: str, spec: EstimatorSpec | None = None) -> 
 
 
 def _policy(scenario: Scenario, role: str, reason: str | None, *, external: bool) -> Policy:
-    recovery, source = scenario.recovery, scenario.input
+    recovery = scenario.recovery
     wanted = recovery.wanted(role)
-    if wanted == "continue" and isinstance(source, ClosedLoop) and role == role_of(source.estimator):
+    if wanted == "continue" and _is_followed(scenario, role):
         if role in recovery.roles:
             raise UsageError(
                 f"recovery.roles.{role}: got 'continue'; allowed: restart, fail; the controller follows it"
@@ -95,10 +95,16 @@ def _policy(scenario: Scenario, role: str, reason: str | None, *, external: bool
         wanted = None
     if wanted == "restart" and reason is not None:
         key = f"roles.{role}" if role in recovery.roles else "policy"
-        raise UsageError(f"recovery.{key}: got 'restart' for {role}; allowed: fail; {reason}")
+        others = "continue, fail" if role.startswith(_ESTIMATOR) and not _is_followed(scenario, role) else "fail"
+        raise UsageError(f"recovery.{key}: got 'restart' for {role}; allowed: {others}; {reason}")
     if wanted is None:
         return "fail" if reason is not None or external else "restart"
     return wanted
+
+
+def _is_followed(scenario: Scenario, role: str) -> bool:
+    source = scenario.input
+    return isinstance(source, ClosedLoop) and role == role_of(source.estimator)
 
 
 _ESTIMATOR, _LINK = role_of(""), "link."

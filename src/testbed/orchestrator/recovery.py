@@ -15,7 +15,7 @@ from math import inf
 from testbed.errors import TestbedError, UsageError
 from testbed.estimator.service import role_of
 from testbed.orchestrator.collect import Collector
-from testbed.orchestrator.policies import policy_of_service, unable
+from testbed.orchestrator.policies import policy_of_service
 from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Services
 from testbed.orchestrator.summary import Recovered
@@ -164,8 +164,6 @@ class Recovery:
         self.specs[role.name] = role
         if self.policies:
             self.policies[role.name] = policy_of_service(self._setup.scenario, role.name, spec)
-        if (reason := unable(self._setup.scenario, role.name, spec)) is not None:
-            self.silent[role.name] = reason
 
     def served(self, role: str, order: Order) -> None:
         """A service was told something on its way that it is to be told again."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from testbed.errors import UsageError
 from testbed.estimator.service import builder, role_of
@@ -20,7 +20,9 @@ from testbed.orchestrator.recovery import Checkpoint
 from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Origin, Turn
 from testbed.orchestrator.summary import Downtime, Happened, Recovered, read_summary
+from testbed.orchestrator.timeline import happened
 from testbed.scenario import EstimatorSpec, Scenario, parse_scenario
+from testbed.scenario.events import Event
 from testbed.wire.messages import Status
 from testbed.wire.node import ORCHESTRATOR
 
@@ -55,8 +57,7 @@ class Resumed:
     @property
     def record(self) -> Recovered:
         """What the summary says of it."""
-        figures = self.found.figures
-        done = figures[-1].to if figures else 0
+        done = _last_step(self.found)
         return Recovered(role=ORCHESTRATOR, how="did not finish", step=done, policy="restart", begin=self.step)
 
 
@@ -91,7 +92,14 @@ def resumed(folder: Path) -> Resumed:
         given = parse_scenario(found.begin["scenario"], source=f"{path}: scenario")
         run = str(found.begin["run"])
         commands = {int(note["number"]): note for note in found.notes if "command" in note}
-        refused = tuple(Happened.model_validate(note["refused"]) for note in found.notes if "refused" in note)
+        refused = [Happened.model_validate(note["refused"]) for note in found.notes if "refused" in note]
+        decided = commands.keys() | {entry.number for entry in refused}
+        undecided = [note for note in found.notes if "ordered" in note and note["number"] not in decided]
+        for note in undecided:
+            if note["timed"]:
+                commands[note["number"]] = {"command": note["ordered"], "by": "command", "when": None, "true": None}
+            else:
+                refused.append(_not_done(note, _last_step(found)))
         origins = {
             len(given.events) + place: Origin(note["by"], number, note["when"], note["true"])
             for place, (number, note) in enumerate(sorted(commands.items()))
@@ -113,7 +121,21 @@ def resumed(folder: Path) -> Resumed:
         anew = "there is no checkpoint of it"
     else:
         step = found.checkpoint.step
-    return Resumed(run, given, scenario, step, found, origins, refused, external, before, found.lost, anew)
+    return Resumed(run, given, scenario, step, found, origins, tuple(refused), external, before, found.lost, anew)
+
+
+def _not_done(note: dict[str, Any], step: int) -> Happened:
+    """Of an order that was not decided yet when the run ended, nobody knows the step at which it would have been."""
+    event: Event = TypeAdapter(Event).validate_python(note["ordered"])
+    when = getattr(event, "when", None)
+    origin = Origin("condition" if when else "command", int(note["number"]), when)
+    reason = "the run was cut off before it was decided"
+    return happened(event, origin, step).model_copy(update={"ok": False, "reason": reason})
+
+
+def _last_step(found: Found) -> int:
+    """Up to which there are figures."""
+    return found.figures[-1].to if found.figures else 0
 
 
 def _why_none(folder: Path) -> str:

@@ -243,6 +243,9 @@ class Run:
                         else:
                             conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
                     self._tell(conductor)
+                    for node, role in [entry for entry in nodes if entry[0].stopped]:
+                        node.report("stopped", role.counters)
+                        drop(node.name)
                     if self._keeper is not None:
                         self._keeper.tick()
             except TestbedError as error:
@@ -373,7 +376,7 @@ class Run:
             self._keep(conductor)
             if conductor.activity != last:
                 last, since = conductor.activity, now
-            elif now - since > deadline_s and not (patient and not conductor.started):
+            elif now - since > deadline_s and not (patient and (not conductor.started or conductor.recovery.down)):
                 conductor.fail(f"no progress for {deadline_s:g} s; waiting for {conductor.awaiting()}")
         self._tell(conductor)
         if conductor.failure is not None and conductor.failure.endswith(" is gone"):

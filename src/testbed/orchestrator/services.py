@@ -385,6 +385,7 @@ def _happened(entry: _Pending, step: int) -> Happened:
         to=to if to is None or isinstance(to, str) else _table(to),
         handover=entry.plan.handover,
         acks=getattr(event, "acks", None),
+        due=entry.plan.step if entry.origin.by == "timeline" and step > entry.plan.step else None,
     )
 
 

@@ -123,9 +123,9 @@ class ServicesInTime(Services):
         """As there; a change of one that is lost on the way is put off until it is back."""
         entry = self._of(role)
         if entry is None:
-            for talk in [talk for talk in self._talks.values() if role in (talk.old, talk.new)]:
-                if role == talk.new or not self._is_handed(talk):
-                    self._put_off(talk)
+            for affected in [talk for talk in self._talks.values() if role in (talk.old, talk.new)]:
+                if role == affected.new or not self._is_handed(affected):
+                    self._put_off(affected)
             return False
         own = self._talks.get(id(entry))
         return super().lost(role, reason if own is None else own.given_up or reason)
@@ -247,7 +247,7 @@ class ServicesInTime(Services):
             self._tell(talk, talk.old, "leave")
         self._settle(talk.entry, talk.step, size)
         if talk.entry.origin.by == "timeline" and talk.step > talk.entry.plan.step:
-            self._say(f"step {talk.step}: {self.happened[-1].text}; it was to be at step {talk.entry.plan.step}")
+            self._say(f"step {talk.step}: {self.happened[-1].text}")
 
     def _end_at(self, talk: _Talk) -> None:
         """The old one leaves after the step before, and none comes in its place."""

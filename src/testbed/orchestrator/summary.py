@@ -219,6 +219,9 @@ class Happened(_Model):
     )
     when: str | None = Field(default=None, description="the condition for which it waited")
     true_at: NonNegativeInt | None = Field(default=None, description="step at which the condition began to hold")
+    due: NonNegativeInt | None = Field(
+        default=None, description="step at which it was to take effect, where it was put off: in real time only"
+    )
     link: str | None = Field(default=None, description="which link")
     set: dict[str, Any] | None = Field(default=None, description="keys of the link that changed")
     links: tuple[str, ...] | None = Field(default=None, description="which links were cut or healed")
@@ -242,7 +245,7 @@ class Happened(_Model):
     @property
     def text(self) -> str:
         """In words."""
-        text = self._what()
+        text = self._what() + ("" if self.due is None else f", put off from step {self.due}")
         return text if self.ok else f"{text}: not done: {self.reason}"
 
     @property

@@ -100,6 +100,8 @@ class Timeline:
         """Those that need nobody but the roles: they hold from their step on, whatever happens."""
         self.others: list[Happened] = []
         """What was done to processes and with snapshots, and what was refused."""
+        self.accepted: Callable[[Any, int, bool], None] = lambda event, number, timed: None
+        """Called with an event that somebody ordered, its number, and whether it is to be at a certain moment."""
         self.decided: Callable[[Any, Origin, int], None] = lambda event, origin, step: None
         """Called with what takes effect, and the step."""
         self.refused: Callable[[Happened], None] = lambda entry: None
@@ -200,6 +202,7 @@ class Timeline:
         else:
             self._take(event, Origin("command", number), step)
         self._ordered += 1
+        self.accepted(event, number, timed)
         return number
 
     def told_to(self, part: str) -> list[bytes]:

@@ -55,7 +55,9 @@ def asyncapi() -> dict[str, Any]:
                 "one step to the next, with the numbers going on; "
                 "seq counts its messages from 0. What joins at step k passes over the packets before, and counts them. "
                 f"A query on {keys.handover('{role}')} orders an estimator's service to give or take a snapshot, to "
-                "serve another name, or to leave. What a "
+                "serve another name, or to leave; in real time it is told on "
+                f"{keys.told('{role}')}, answers on {keys.said('{role}')}, and is handed a state on "
+                f"{keys.handed('{role}')}. What a "
                 f"role publishes on {keys.warm('{role}')} is read by nobody."
             ),
         },

@@ -16,17 +16,28 @@ def check_links(scenario: Scenario) -> None:
     """Raises UsageError for a link that its backend cannot do, on this machine or at all."""
     names = real_links(scenario)
     if names and scenario.clock.real:
-        backend = getattr(scenario.links, names[0]).backend
-        raise UsageError(
-            f"clock.mode: got 'real' with links.{names[0]}.backend {backend!r}, which keeps the pace itself; allowed: "
-            "virtual, or backend 'model'"
-        )
+        _check_deadlines(scenario, names)
     for name in names:
         for variant in scenario.variants(name):
             check_link(scenario, name, variant)
     kernel = [name for name in names if getattr(scenario.links, name).backend == "kernel"]
     if kernel:
         _check_kernel(kernel[0])
+
+
+def _check_deadlines(scenario: Scenario, names: list[str]) -> None:
+    """Raises UsageError where an estimate could never be in time: that a packet is lost is known at its deadline."""
+    period_ns = scenario.clock.period_ns
+    ns = {name: getattr(scenario.links, name).deadline_ns(period_ns) if name in names else 0 for name in names}
+    last = max(("observation", "ack"), key=lambda name: ns.get(name, 0))
+    way = [name for name in ("control", last) if ns.get(name, 0)]
+    total, allowed = sum(ns[name] for name in way), scenario.clock.deadline_ns
+    if total >= allowed:
+        which = " + ".join(f"links.{name}.deadline" for name in way)
+        raise UsageError(
+            f"{which}: got {total / 1e6:g} ms with clock mode 'real'; allowed: less than clock.deadline, "
+            f"{allowed / 1e6:g} ms, for the loss of a packet is known at its deadline"
+        )
 
 
 def check_link(scenario: Scenario, name: str, link: SteppedImpairments) -> None:

@@ -40,7 +40,7 @@ class RealLinkService:
 
     A message whose deadline passes before it arrives is lost for its step: that is said then, and if it comes after
     all, it goes with the next step of its block; late control packets are dropped. The control link keeps the pace of
-    the run; the other links send at once.
+    the run, where the controller does not; the other links send at once.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class RealLinkService:
         self._path = node.leaving.enter_context(path)
         self._deliver = node.sender(node.keys.delivered(link), model, tap=True)
         self._pace = Pace(node, self._timer, scenario.clock.period_ns, self._send)
-        take = self._pace if link == "control" else self._send
+        take = self._pace if link == "control" and not setup.real else self._send
         node.on(node.keys.sent(link), model, sender, take, needs=(name,))
         node.on(node.keys.change(link), Change, ORCHESTRATOR, self._note)
         self._check()

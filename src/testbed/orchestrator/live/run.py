@@ -15,6 +15,7 @@ from typing import Any, NoReturn, TypeVar
 from pydantic_core import PydanticCustomError
 
 from testbed.errors import RunFailed, UsageError
+from testbed.orchestrator.asked import status_of
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.desk import RunOver
 from testbed.orchestrator.live.actions import Actions, Moment
@@ -105,7 +106,7 @@ class LiveRun(Actions):
     def status(self) -> dict[str, Any]:
         """How far it is, who estimates, what has happened; and ``status``: held, running, or how it has ended."""
         conductor = self._of_conductor
-        found = conductor.status() if self._over else self._ask(Conductor.status)
+        found = status_of(conductor) if self._over else self._ask(status_of)
         if self._summary is not None:
             return {**found, "status": self._summary.status}
         return {**found, "status": "running" if conductor.held_at is None else "held"}
