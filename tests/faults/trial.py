@@ -55,7 +55,7 @@ def trial(seed: int, folder: Path, *, twice: bool = True) -> Trial:
     refused = [event for event in made.disturbed.summary.events if not event.ok]
     if refused != [event for event in plain.summary.events if not event.ok]:
         plain = once(_without(table, made.disturbed), folder / "without")
-    made.problems = findings(plain, made.disturbed, made.recovery)
+    made.problems = findings(plain, made.disturbed, made.recovery, [event["role"] for event in made.ends])
     if twice:
         made.problems += made.disturbed.unlike(disturbed(folder / "again"))
     return made

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +28,12 @@ class Outcome:
     killed: list[str]
     log: list[str]
 
+    @property
+    def unnoticed(self) -> list[str]:
+        """Roles that died so late that nobody started them anew: what they had to report is lost with them."""
+        again = [lost.role for lost in self.summary.recovered]
+        return sorted(role for role in set(self.killed) if self.killed.count(role) > again.count(role))
+
     def unlike(self, again: Outcome) -> list[str]:
         """In what a second run with the same faults differs."""
         figures, others = (determined(outcome.summary, {"timing"}) for outcome in (self, again))
@@ -49,15 +55,15 @@ def determined(summary: Summary, but: set[str]) -> Table:
     return table
 
 
-def findings(plain: Outcome, disturbed: Outcome, recovery: Table) -> list[str]:
-    """What is wrong; nothing where all is as it should be."""
+def findings(plain: Outcome, disturbed: Outcome, recovery: Table, ended: Sequence[str] = ()) -> list[str]:
+    """What is wrong; nothing where all is as it should be. ended: the roles that the timeline ends."""
     summary = disturbed.summary
     out = [*_books(summary), *_finite(summary), *_counted(summary, disturbed.observed)]
     if plain.summary.status != "complete":
         return [*out, f"without faults it is {plain.summary.status}: {plain.summary.reason}"]
     if summary.status == "complete":
         return [*out, *_same(plain, disturbed)]
-    return [*out, *_explained(summary, disturbed.killed, recovery), *_same_beginning(plain, disturbed)]
+    return [*out, *_explained(disturbed, ended, recovery), *_same_beginning(plain, disturbed)]
 
 
 def _last(figures: EstimatorFigures, summary: Summary) -> int:
@@ -105,11 +111,12 @@ def _same(plain: Outcome, disturbed: Outcome) -> Iterator[str]:
     """Equal to the bit: figures, recording, figures by lane."""
     but = INCIDENTAL | ({"events"} if any(not event.ok for event in disturbed.summary.events) else set())
     wanted, found = determined(plain.summary, but), determined(disturbed.summary, but)
+    for role in disturbed.unnoticed:
+        for table in (wanted, found):
+            _without_report(table, role)
     for key in wanted:
         if wanted[key] != found[key]:
             yield f"{key} differs: {_where(wanted[key], found[key])}"
-    if disturbed.summary.estimators != plain.summary.estimators:
-        return
     if plain.observed.recorded != disturbed.observed.recorded:
         keys = plain.observed.recorded.keys() ^ disturbed.observed.recorded.keys()
         yield f"the recording differs: only in one {sorted(keys)[:5]}"
@@ -119,9 +126,24 @@ def _same(plain: Outcome, disturbed: Outcome) -> Iterator[str]:
         yield "the files differ"
 
 
-def _explained(summary: Summary, killed: list[str], recovery: Table) -> Iterator[str]:
+def _without_report(table: Table, role: str) -> None:
+    """Leave out what a role says of itself at its end."""
+    kind, _, name = role.partition(".")
+    if kind == "estimator":
+        table["estimators"].get(name.partition(".")[0], {}).pop("counters", None)
+    elif kind == "link":
+        table["links"].pop(name, None)
+        table["checks"] = [check for check in table["checks"] if check["name"] != "books"]
+    elif kind == "controller":
+        table["controller"] = None
+
+
+def _explained(outcome: Outcome, ended: Sequence[str], recovery: Table) -> Iterator[str]:
     """A run that has failed says who was lost, and could not go on."""
-    killed = [*killed, *(lost.role for lost in summary.recovered)]
+    summary = outcome.summary
+    if any(summary.reason == f"{role.replace('.', ' ')} did not report" for role in outcome.unnoticed):
+        return
+    killed = [*outcome.killed, *ended]
     role = next((role for role in killed if summary.reason is not None and summary.reason.startswith(role)), None)
     if summary.status != "failed" or role is None:
         yield f"{summary.status}: {summary.reason}"
