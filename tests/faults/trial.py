@@ -82,7 +82,7 @@ def _recovery(draw: random.Random, table: Table) -> Table:
 
 
 def _without(table: Table, outcome: Outcome) -> Table:
-    """The scenario without the events that were not done."""
+    """The scenario without the events that were not done, and without those that build on them."""
     refused = {
         (event.step, event.action, event.estimator, event.name) for event in outcome.summary.events if not event.ok
     }
@@ -91,4 +91,16 @@ def _without(table: Table, outcome: Outcome) -> Table:
         for event in table["events"]
         if (max(1, event.get("at", 0)), event["action"], event.get("estimator"), event.get("name")) not in refused
     ]
+    never = {event.get("name", event["estimator"]) for event in table["events"] if event not in kept and _begins(event)}
+    kept = [
+        event for event in kept if not never & {event.get("to") if _promotes(event) else None, event.get("estimator")}
+    ]
     return {**table, "events": kept}
+
+
+def _begins(event: Table) -> bool:
+    return event["action"] in ("add", "shadow")
+
+
+def _promotes(event: Table) -> bool:
+    return isinstance(event.get("to"), str)
