@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 from unittest.mock import patch
 
@@ -12,6 +13,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from cli.commands import TABLES, Command, testbed, write
+from orchestrator.cutting import cut_run
 from testbed import __version__
 from testbed.estimator.registry import create, model_of
 from testbed.scenario import load_scenario, parse_scenario, scenario_json_schema, to_dict
@@ -282,3 +284,51 @@ def test_asyncapi_is_an_asyncapi_document(testbed: Command) -> None:
     document = json.loads(testbed("schema", "asyncapi").out)
     assert document["asyncapi"] == "3.0.0"
     assert set(document) >= {"info", "channels", "components"}
+
+
+RESUMABLE = {"record": "none", "recovery": {"journal": True, "every": 2}, "clock": {"window": 2}}
+
+
+def test_a_run_that_was_cut_off_is_resumed(testbed: Command, tmp_path: Path, no_report: object) -> None:
+    write(tmp_path / "s.toml", **RESUMABLE)
+    assert testbed("run", "s.toml", "--in-process", "--json", "--out", "plain").code == 0
+    assert cut_run(load_scenario(tmp_path / "s.toml"), tmp_path / "cut", 120, tmp_path / "left", settled=True)
+    shown = testbed("resume", "left", "--in-process", "--json", "-q")
+    assert shown.code == 0
+    (line,) = shown.err.splitlines()
+    assert re.fullmatch(r"resuming after step [1-9]\d* of 12", line)
+    plain, again = json.loads((tmp_path / "plain" / "summary.json").read_text()), json.loads(shown.out)
+    assert again["estimators"] == plain["estimators"]
+    assert [entry["role"] for entry in again["recovered"]] == ["orchestrator"]
+
+
+def test_what_is_damaged_is_said_and_what_it_means(testbed: Command, tmp_path: Path, no_report: object) -> None:
+    write(tmp_path / "s.toml", **RESUMABLE)
+    assert cut_run(load_scenario(tmp_path / "s.toml"), tmp_path / "cut", 120, tmp_path / "left", settled=True)
+    damaged = list((tmp_path / "left" / "journal").glob("checkpoint-*.bin"))
+    for path in damaged:
+        path.write_bytes(path.read_bytes()[:-1])
+    shown = testbed("resume", "left", "--in-process", "-q")
+    assert shown.code == 0
+    *lines, last = shown.err.splitlines()
+    assert len(lines) == len(damaged) > 0
+    assert all(line.startswith("damaged: left/journal/checkpoint-") for line in lines)
+    assert last == "beginning anew: there is no checkpoint of it"
+
+
+@pytest.mark.parametrize("folder", ["nowhere", "empty", "s.toml", "plain", "external"])
+def test_what_cannot_be_resumed(folder: str, testbed: Command, tmp_path: Path, no_report: object) -> None:
+    (tmp_path / "empty").mkdir()
+    write(tmp_path / "s.toml", **RESUMABLE)
+    if folder == "plain":
+        assert testbed("run", "s.toml", "--in-process", "--out", "plain").code == 0
+    if folder == "external":
+        assert cut_run(load_scenario(tmp_path / "s.toml"), tmp_path / "cut", 120, tmp_path / folder, settled=True)
+        begin = tmp_path / folder / "journal" / "begin.json"
+        begin.write_text(begin.read_text().replace('"external": []', '"external": ["estimator.aoe"]'))
+    shown = testbed("resume", folder, "--in-process", "-q")
+    text = {
+        "plain": "plain: its run is complete; allowed: the folder of a run that was not finished",
+        "external": "estimator.aoe: started by hand in this run; allowed: to go on over processes",
+    }.get(folder, f"{folder}: no run to be resumed; allowed: the folder of a run that was not finished")
+    assert (shown.code, shown.out, shown.err.splitlines()[-1]) == (2, "", f"testbed: {text}")

@@ -19,7 +19,8 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         made = (trial_over_processes if options.processes else trial)(options.seed, Path(folder))
-    print(to_toml(parse_scenario({**made.table, "recovery": made.recovery})))
+    events = [*made.table["events"], *made.ends]
+    print(to_toml(parse_scenario({**made.table, "recovery": made.recovery, "events": events})))
     print(f"# order of delivery: seed {made.schedule}" if made.schedule is not None else "# over processes")
     for fault in made.faults:
         print(f"# {fault}")

@@ -74,11 +74,19 @@ class DisturbedNetwork(MemoryNetwork):
             raise _Died(bus)
         if bus.steps_left:
             bus.steps_left -= 1
+        if key.endswith("/command") and b'"action":"stop"' in payload:
+            self._is_over()
         message = _Message(key, payload)
         bus.sent.append(message)
         seen = self._seen[key]
         seen.append(payload)
         self._send(message)
+
+    def _is_over(self) -> None:
+        """All that is left is to report; nobody is started anew for that."""
+        self._coming.clear()
+        for bus in self._buses:
+            bus.steps_left = None
 
     def die(self, bus: DisturbedBus) -> None:
         """Close the bus of a role; what nobody has received of it yet may be lost."""

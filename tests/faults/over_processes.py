@@ -22,7 +22,7 @@ from testbed.orchestrator.run import Run
 from testbed.orchestrator.summary import Summary
 from testbed.scenario import parse_scenario
 
-STEPS = 1500
+STEPS = 600
 _WATCHED = ("testbed.plant", "testbed.channel", "testbed.control", "testbed.estimator")
 
 
@@ -89,8 +89,9 @@ def _disturbed(table: Table, folder: Path, coming: list[Signal]) -> tuple[Summar
             if not roles:
                 continue
             command, pid = roles[int(one.which * len(roles))]
-            log.append(f"past step {completed}: {one.number.name} to {_shown(command)}")
-            killed.append(_shown(command))
+            log.append(f"past step {completed}: {one.number.name} to {_role(command)}")
+            if one.cont_s is None:
+                killed.append(_role(command))
             with suppress(ProcessLookupError):
                 os.kill(pid, one.number)
                 if one.cont_s is not None:
@@ -111,6 +112,11 @@ def _is_role(command: str) -> bool:
     return any(f"-m {module}" in command for module in _WATCHED)
 
 
-def _shown(command: str) -> str:
-    words = command.split(" -m ", 1)[1].split()
-    return " ".join(words[: words.index("--connect")])
+def _role(command: str) -> str:
+    """Of a role's process."""
+    words = command.split()
+    module = words[words.index("-m") + 1].removeprefix("testbed.")
+    for option, kind in (("--role", ""), ("--name", "estimator."), ("--link", "link.")):
+        if option in words:
+            return kind + words[words.index(option) + 1]
+    return {"control": "controller", "estimator.bounds_service": "bounds"}.get(module, module)

@@ -15,7 +15,7 @@ OPTIONS: dict[str, Table] = {"gpb": {"order": 2}, "pf": {"particles": 6}}
 """Of kinds that need some, or that would take long without."""
 CHEAP = ("aoe", "ff", "gpb", "gpb1", "gpb2", "imm", "kf", "kfio", "lmmse", "pf", "oe", "rse", "rseio", "rsemm")
 _WEIGHTS = (6, 3, 2, 2, 1, 3, 1, 4, 1, 1, 1, 1, 1, 1)
-_NEEDS_ACKS = ("kf", "kfio", "rseio")
+_NEEDS_ACKS = ("kf", "kfio", "rse", "rseio", "rsemm")
 _OE_UNTIL = 8
 
 

@@ -13,7 +13,7 @@ from faults.disturbances import Disturbance, disturbances
 from faults.network import DisturbedNetwork
 from faults.observed import Observed, files_of
 from faults.scenarios import scenario_table
-from faults.timeline import events
+from faults.timeline import ends, events
 from faults.verdict import Outcome, findings
 from orchestrator.runs import run
 from testbed.scenario import parse_scenario
@@ -23,13 +23,17 @@ Table = dict[str, Any]
 
 @dataclass
 class Trial:
-    """table: the scenario; recovery: its table [recovery]; faults: what else happens; schedule: order of delivery."""
+    """table: the scenario; recovery: its table [recovery]; ends: events that end processes; faults: what else happens.
+
+    schedule: the order of delivery; None: over processes.
+    """
 
     seed: int
     table: Table
     recovery: Table
     schedule: int | None
     faults: list[Any] = field(default_factory=list)
+    ends: list[Table] = field(default_factory=list)
     plain: Outcome | None = None
     disturbed: Outcome | None = None
     problems: list[str] = field(default_factory=list)
@@ -43,14 +47,15 @@ def trial(seed: int, folder: Path, *, twice: bool = True) -> Trial:
     made = Trial(seed, table, _recovery(draw, table), schedule=draw.randrange(2**31))
     made.plain = once(table, folder / "plain")
     made.faults = disturbances(draw, made.plain.messages)
-    with_recovery = {**table, "recovery": made.recovery}
+    made.ends = ends(draw, table)
+    with_recovery = {**table, "recovery": made.recovery, "events": [*table["events"], *made.ends]}
     disturbed = partial(once, with_recovery, schedule=made.schedule, faults=made.faults)
     made.disturbed = disturbed(folder / "disturbed")
     plain = made.plain
     refused = [event for event in made.disturbed.summary.events if not event.ok]
     if refused != [event for event in plain.summary.events if not event.ok]:
         plain = once(_without(table, made.disturbed), folder / "without")
-    made.problems = findings(plain, made.disturbed, made.recovery)
+    made.problems = findings(plain, made.disturbed, made.recovery, [event["role"] for event in made.ends])
     if twice:
         made.problems += made.disturbed.unlike(disturbed(folder / "again"))
     return made
@@ -84,6 +89,6 @@ def _without(table: Table, outcome: Outcome) -> Table:
     kept = [
         event
         for event in table["events"]
-        if (max(1, event["at"]), event["action"], event.get("estimator"), event.get("name")) not in refused
+        if (max(1, event.get("at", 0)), event["action"], event.get("estimator"), event.get("name")) not in refused
     ]
     return {**table, "events": kept}

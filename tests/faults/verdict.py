@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from faults.observed import Observed
-from testbed.orchestrator.summary import Summary
+from testbed.orchestrator.summary import EstimatorFigures, Summary
 
 Table = dict[str, Any]
+ENDS = ("kill", "restart")
+"""Events that end a process."""
 INCIDENTAL = {"timing", "recovered", "repeated", "rejected"}
 """What faults may change in a summary."""
 
@@ -25,6 +27,12 @@ class Outcome:
     messages: int
     killed: list[str]
     log: list[str]
+
+    @property
+    def unnoticed(self) -> list[str]:
+        """Roles that died so late that nobody started them anew: what they had to report is lost with them."""
+        again = [lost.role for lost in self.summary.recovered]
+        return sorted(role for role in set(self.killed) if self.killed.count(role) > again.count(role))
 
     def unlike(self, again: Outcome) -> list[str]:
         """In what a second run with the same faults differs."""
@@ -41,18 +49,26 @@ class Outcome:
 
 
 def determined(summary: Summary, but: set[str]) -> Table:
-    return summary.model_dump(exclude=but)
+    table = summary.model_dump(exclude=but)
+    if "events" in table:
+        table["events"] = [event for event in table["events"] if event["action"] not in ENDS]
+    return table
 
 
-def findings(plain: Outcome, disturbed: Outcome, recovery: Table) -> list[str]:
-    """What is wrong; nothing where all is as it should be."""
+def findings(plain: Outcome, disturbed: Outcome, recovery: Table, ended: Sequence[str] = ()) -> list[str]:
+    """What is wrong; nothing where all is as it should be. ended: the roles that the timeline ends."""
     summary = disturbed.summary
     out = [*_books(summary), *_finite(summary), *_counted(summary, disturbed.observed)]
     if plain.summary.status != "complete":
         return [*out, f"without faults it is {plain.summary.status}: {plain.summary.reason}"]
     if summary.status == "complete":
         return [*out, *_same(plain, disturbed)]
-    return [*out, *_explained(summary, disturbed.killed, recovery), *_same_beginning(plain, disturbed)]
+    return [*out, *_explained(disturbed, ended, recovery), *_same_beginning(plain, disturbed)]
+
+
+def _last(figures: EstimatorFigures, summary: Summary) -> int:
+    """The last complete step at which an estimator was there."""
+    return summary.completed_steps if figures.until is None else min(figures.until, summary.completed_steps)
 
 
 def _books(summary: Summary) -> Iterator[str]:
@@ -68,7 +84,7 @@ def _books(summary: Summary) -> Iterator[str]:
 def _finite(summary: Summary) -> Iterator[str]:
     """A figure that is not finite is null in a summary: each step of an estimator that was there has its figures."""
     for name, figures in summary.estimators.items():
-        last = min(figures.until or summary.steps, summary.completed_steps)
+        last = _last(figures, summary)
         for what in ("trace_P_mean", "squared_error_mean"):
             values = getattr(figures, what)[max(0, figures.since - 1) : last]
             if any(value is None or not math.isfinite(value) for value in values):
@@ -81,7 +97,7 @@ def _counted(summary: Summary, observed: Observed) -> Iterator[str]:
     """Every step and block of lanes has exactly one estimate of each estimator that is there then."""
     lanes = sorted({lane for _, _, lane in observed.estimates})
     for name, figures in summary.estimators.items():
-        for step in range(max(1, figures.since), min(figures.until or summary.steps, summary.completed_steps) + 1):
+        for step in range(max(1, figures.since), _last(figures, summary) + 1):
             for lane in lanes:
                 times = observed.estimates[name, step, lane]
                 if times != 1:
@@ -95,11 +111,12 @@ def _same(plain: Outcome, disturbed: Outcome) -> Iterator[str]:
     """Equal to the bit: figures, recording, figures by lane."""
     but = INCIDENTAL | ({"events"} if any(not event.ok for event in disturbed.summary.events) else set())
     wanted, found = determined(plain.summary, but), determined(disturbed.summary, but)
+    for role in disturbed.unnoticed:
+        for table in (wanted, found):
+            _without_report(table, role)
     for key in wanted:
         if wanted[key] != found[key]:
             yield f"{key} differs: {_where(wanted[key], found[key])}"
-    if disturbed.summary.estimators != plain.summary.estimators:
-        return
     if plain.observed.recorded != disturbed.observed.recorded:
         keys = plain.observed.recorded.keys() ^ disturbed.observed.recorded.keys()
         yield f"the recording differs: only in one {sorted(keys)[:5]}"
@@ -109,13 +126,33 @@ def _same(plain: Outcome, disturbed: Outcome) -> Iterator[str]:
         yield "the files differ"
 
 
-def _explained(summary: Summary, killed: list[str], recovery: Table) -> Iterator[str]:
+def _without_report(table: Table, role: str) -> None:
+    """Leave out what a role says of itself at its end."""
+    kind, _, name = role.partition(".")
+    if kind == "estimator":
+        table["estimators"].get(name.partition(".")[0], {}).pop("counters", None)
+    elif kind == "link":
+        table["links"].pop(name, None)
+        table["checks"] = [check for check in table["checks"] if check["name"] != "books"]
+    elif kind == "controller":
+        table["controller"] = None
+
+
+def _explained(outcome: Outcome, ended: Sequence[str], recovery: Table) -> Iterator[str]:
     """A run that has failed says who was lost, and could not go on."""
+    summary = outcome.summary
+    if any(summary.reason == f"{role.replace('.', ' ')} did not report" for role in outcome.unnoticed):
+        return
+    killed = [*outcome.killed, *ended]
     role = next((role for role in killed if summary.reason is not None and summary.reason.startswith(role)), None)
     if summary.status != "failed" or role is None:
         yield f"{summary.status}: {summary.reason}"
-    elif recovery.get("policy") != "fail" and killed.count(role) <= recovery["restarts"]:
+    elif recovery.get("policy") != "fail" and _restarts(summary, role) < recovery["restarts"]:
         yield f"failed although {role} could be started anew: {summary.reason}"
+
+
+def _restarts(summary: Summary, role: str) -> int:
+    return sum(lost.role == role for lost in summary.recovered)
 
 
 def _same_beginning(plain: Outcome, disturbed: Outcome) -> Iterator[str]:

@@ -29,12 +29,13 @@ def _never(node: Node, setup: Setup) -> Any:
 class Bench:
     """A conductor, and everybody else."""
 
-    def __init__(self, **changes: Any) -> None:
+    def __init__(self, policies: dict[str, Any] | None = None, **changes: Any) -> None:
         own = {"steps": 6, "lanes": 2, "estimators": [{"name": "aoe"}, {"name": "kfio", "acks": "perfect", "until": 4}]}
         self.setup = Setup(RUN, scenario(**{**own, "clock": {"window": 2}, **changes}))
         self.network = MemoryNetwork()
         roles = [RoleSpec(role, _never, "none") for role in ROLES]
-        self.conductor = Conductor(self.network.bus(), self.setup, roles, None)
+        policies = {f"estimator.{name}": policy for name, policy in (policies or {}).items()}
+        self.conductor = Conductor(self.network.bus(), self.setup, roles, None, policies)
         self.started: list[int] = []
         self.conductor.on_started = lambda: self.started.append(1)
         self.grants: list[int] = []
@@ -245,3 +246,23 @@ def test_estimates_after_the_end_of_an_estimator_are_refused() -> None:
     for k in (5, 6):
         bench.step(k)
     assert bench.conductor.collector.estimators["kfio"].mean["trace_P"][4:] == [None, None]
+
+
+@pytest.mark.parametrize("policy", ["continue", "restart", "fail"])
+def test_an_estimator_that_fails_by_itself_is_missed_or_ends_the_run(policy: str) -> None:
+    """Begun anew it would fail again."""
+    bench = Bench({"aoe": policy})
+    bench.join(*ROLES)
+    bench.step(1)
+    bench.say("estimator.aoe", "failed", "ZeroDivisionError: no luck")
+    bench.conductor.ended("estimator.aoe", "exit code 1")
+    if policy != "continue":
+        assert bench.conductor.failure == "estimator.aoe: ZeroDivisionError: no luck"
+        return
+    assert bench.conductor.failure is None
+    (entry,) = bench.conductor.recovery.happened
+    assert entry.text == ("estimator.aoe failed: ZeroDivisionError: no luck: the run went on without it from step 2 on")
+    for k in range(2, 7):
+        for role in ("plant", "bounds", *(["estimator.kfio"] if k <= 4 else [])):
+            bench.packet(role, k)
+    assert bench.conductor.collector.finished

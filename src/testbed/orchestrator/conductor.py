@@ -494,7 +494,11 @@ class Conductor:
             self.watchdog.alive.add(role)
             return
         self.reports[role] = status
-        if status.state == "failed" and not self._lost(role, status.detail):
+        if status.state != "failed" or self._lost(role, status.detail):
+            return
+        if self.recovery.policy(role) == "continue":
+            self._is_lost(role, f"failed: {status.detail}")
+        else:  # it would fail again where it begins anew
             self.fail(f"{role}: {status.detail}")
 
     def _truth(self, packet: Truth, arrays: Arrays) -> None:

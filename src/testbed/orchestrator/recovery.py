@@ -25,6 +25,7 @@ from testbed.wire.begin import Begin, Given
 from testbed.wire.bundle import unbundle
 from testbed.wire.handover import Order
 from testbed.wire.setup import Setup
+from testbed.wire.state import unpack
 
 
 @dataclass
@@ -174,6 +175,7 @@ class Recovery:
         for message in unbundle(payload):
             try:
                 given, data = Given.split(message)
+                unpack(data)
             except UsageError:
                 self.rejected["schema"] += 1
                 continue

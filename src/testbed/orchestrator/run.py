@@ -243,9 +243,10 @@ class Run:
                         else:
                             conductor.fail(f"nothing moves any more; waiting for {conductor.awaiting()}")
                     self._tell(conductor)
-                    for node, role in [entry for entry in nodes if entry[0].stopped]:
-                        node.report("stopped", role.counters)
-                        drop(node.name)
+                    if conductor.awaited_words:
+                        for node, role in [entry for entry in nodes if entry[0].stopped]:
+                            node.report("stopped", role.counters)
+                            drop(node.name)
                     if self._keeper is not None:
                         self._keeper.tick()
             except TestbedError as error:

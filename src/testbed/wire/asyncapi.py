@@ -37,7 +37,11 @@ def asyncapi() -> dict[str, Any]:
             "controller, plant and links → recorder: copies of the recorded lanes of what goes over a link "
             "(control, observation or ack; sent or delivered), where a packet holds more lanes than are recorded",
         ),
-        "status": (keys.status("{role}"), "status", "role → orchestrator, its last word"),
+        "status": (
+            keys.status("{role}"),
+            "status",
+            "role → orchestrator: its last word, and before that `alive` whenever it is asked with the command `ping`",
+        ),
     }
     return {
         "asyncapi": "3.0.0",
@@ -58,7 +62,7 @@ def asyncapi() -> dict[str, Any]:
                 "serve another name, or to leave; in real time it is told on "
                 f"{keys.told('{role}')}, answers on {keys.said('{role}')}, and is handed a state on "
                 f"{keys.handed('{role}')}. What a "
-                f"role publishes on {keys.warm('{role}')} is read by nobody."
+                f"role publishes on {keys.warm('{role}')} is read by nobody. {_recovery(keys)}"
             ),
         },
         "channels": {
@@ -80,3 +84,22 @@ def asyncapi() -> dict[str, Any]:
             "schemas": schemas["$defs"],
         },
     }
+
+
+def _recovery(keys: Keys) -> str:
+    """What there is for roles that are started anew, and what a program of somebody's own may leave out."""
+    return (
+        f"Recovery: a role asks with its name on {keys.begin} where it begins; the answer is a bundle of a JSON header "
+        "(step, late, lanes, orders, life) and the bytes that go with it: a state for each of the lanes that begin a "
+        "block, a snapshot for each order, and the changes that the role was told of. After every so many steps it "
+        f"gives the state of each block of lanes on {keys.state('{role}')}: the length of a JSON header as a "
+        "little-endian uint32, the header (role, step, lane, life), and bytes of its own choice. It keeps what it "
+        f"sends on KEY, and answers a query on {keys.prefix}/history/KEY, with JSON (since, a number), by a bundle of "
+        "the packets from that number on, by nothing where there is none, or by JSON with error; the command `forget` "
+        "says which are not needed any more. What comes again with a number that it has seen, it passes over and "
+        "counts as `repeated`. A program of somebody's own may leave all of this out, but for two: it must not take a "
+        "packet twice, and it should answer `ping`, for a role that does not is taken for hung when the run stands "
+        "still. Then it cannot be started anew (policy `fail`, or `continue` for an estimator that no controller "
+        "follows), and neither can a role that listens to it. A run with such a role has no checkpoint in its journal: "
+        "when resumed it begins anew."
+    )

@@ -194,7 +194,7 @@ class Node:
                     if gate is not OPEN and isinstance(header, Packet):
                         if gate.passed_over is None:
                             if not gate.keeps(header, partial(receive, message)):
-                                due.number = header.seq + 1
+                                due.number = max(due.number or 0, header.seq + 1)
                             continue
                         early = header.step - header.FIRST_STEP < gate.passed_over
                         begun = turns.begin(gate.passed_over, blocks)
