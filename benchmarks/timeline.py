@@ -45,7 +45,10 @@ def _row(number: int, event: dict[str, Any], real: list[Any], virtual: list[Any]
     row["hand-over"] = event.get("handover") or ("promoted" if event["action"] == "swap" else "")
     row["put off, steps"] = Median.of([entry["step"] - event["at"] for entry in entries])
     name = event.get("name") or event.get("estimator") or "active"
-    both = list(zip(real, entries, strict=True))
+    both = [(summary, entry) for summary, entry in zip(real, entries, strict=True) if entry["ok"]]
+    row["not done"] = len(entries) - len(both)
+    if not both:
+        return row
     row["late, ms"] = Median.of([_late(summary, name, entry["step"]) for summary, entry in both])
     row["other, ms"] = Median.of([_late(summary, LEFT_ALONE, entry["step"]) for summary, entry in both])
     row["on time, steps"] = Median.of([_until_on_time(summary, name, entry["step"]) for summary, entry in both])
