@@ -10,8 +10,15 @@ import pytest
 
 from orchestrator.runs import figures, recorded, run, scenario
 from testbed.errors import UsageError
+from testbed.orchestrator.collect import Collector
+from testbed.orchestrator.recovery import Recovery
+from testbed.orchestrator.roles import roles_of
+from testbed.orchestrator.services import Services
 from testbed.orchestrator.summary import Summary
+from testbed.wire.begin import Given
 from testbed.wire.memory_bus import MemoryNetwork
+from testbed.wire.setup import Setup
+from testbed.wire.state import pack
 
 FOLLOWED = [{"name": "aoe", "acks": "none"}, {"name": "ff", "acks": "none"}]
 KILLED = {"recovered", "repeated"}
@@ -45,7 +52,9 @@ def roles(**changes: Any) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("every", [1, 4, 50])
+@pytest.mark.parametrize(
+    "every", [pytest.param(1, marks=pytest.mark.slow), 4, pytest.param(50, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("role", roles())
 def test_a_role_that_is_lost_changes_nothing(role: str, every: int, tmp_path: Path) -> None:
     given = scenario(recovery={"every": every}, transport={"lanes_per_packet": 4}, clock={"window": 3})
@@ -219,7 +228,7 @@ def killing_after(role: str, *published: int) -> type[MemoryNetwork]:
     return Killing
 
 
-@pytest.mark.parametrize("every", [2, 7, 50])
+@pytest.mark.parametrize("every", [2, pytest.param(7, marks=pytest.mark.slow), 50])
 @pytest.mark.parametrize("role", ["estimator.aoe.2", "estimator.beside", "estimator.late", "estimator.aoe.3"])
 def test_services_that_joined_on_the_way_are_recovered_too(role: str, every: int, tmp_path: Path) -> None:
     given = scenario(recovery={"every": every, "restarts": 100}, estimators=FOLLOWED, events=SWAPS)
@@ -228,3 +237,52 @@ def test_services_that_joined_on_the_way_are_recovered_too(role: str, every: int
     assert all(event.ok for event in plain.events)
     assert {entry.role for entry in lost.recovered} == {role}
     assert without(lost) == without(plain)
+
+
+def give(recovery: Recovery, role: str, step: int, life: int = 0, data: bytes | None = None) -> None:
+    given = Given(role=role, step=step, lane=0, life=life)
+    recovery.take(role, given.with_data(pack({}, step=step) if data is None else data))
+
+
+def test_what_the_dead_have_given_is_no_checkpoint() -> None:
+    """What a new process has not done itself may not be forgotten by those that sent it."""
+    setup = Setup("run0test", scenario(lanes=1, estimators=[{"name": "ff", "acks": "none"}], recovery={"every": 5}))
+    collector = Collector(setup)
+    services = Services(MemoryNetwork().bus(), setup, collector, lambda line: None)
+    specs = roles_of(setup.scenario)
+    recovery = Recovery(setup, collector, services, specs, {spec.name: "restart" for spec in specs})
+    recovery.launch = lambda role: None
+    forgotten: list[int] = []
+    recovery.forget = forgotten.append
+    collector.completed = 12
+    others = [spec.name for spec in specs if spec.name != "plant"]
+    for role in others:
+        give(recovery, role, 5)
+        give(recovery, role, 10)
+    assert recovery.lost("plant", "is gone", started=True)
+    give(recovery, "plant", 5)
+    give(recovery, "plant", 10)
+    assert (recovery.checkpoint.step, forgotten) == (0, []), "from the process that is dead"
+    give(recovery, "plant", 5, life=1)
+    assert (recovery.checkpoint.step, forgotten) == (5, [5])
+    assert recovery.begin("plant", late=True).life == 1
+    assert recovery.lost("link.ack", "is gone", started=True)
+    give(recovery, "plant", 10, life=1)
+    assert forgotten == [5], "the state of 10 that link.ack gave went with it"
+    give(recovery, "link.ack", 10, life=1)
+    assert forgotten == [5, 10]
+
+
+def test_a_step_that_is_not_complete_is_no_checkpoint() -> None:
+    setup = Setup("run0test", scenario(lanes=1, estimators=[{"name": "ff", "acks": "none"}], recovery={"every": 5}))
+    collector = Collector(setup)
+    services = Services(MemoryNetwork().bus(), setup, collector, lambda line: None)
+    specs = roles_of(setup.scenario)
+    recovery = Recovery(setup, collector, services, specs, {spec.name: "restart" for spec in specs})
+    collector.completed = 4
+    for spec in specs:
+        give(recovery, spec.name, 5)
+    assert recovery.checkpoint.step == 0
+    collector.completed = 5
+    recovery.proceed()
+    assert recovery.checkpoint.step == 5

@@ -90,6 +90,7 @@ class Recovery:
         self._origins: dict[str, _Origin] = {}
         self._served: dict[str, list[Order]] = {}
         self._restarts: Counter[str] = Counter()
+        self._refusals: dict[str, str] = {}
         self.rejected: Counter[str] = Counter()
         self._blocks = [lane for lane, _ in setup.blocks]
 
@@ -121,8 +122,9 @@ class Recovery:
         self.down[role] = _Down(time.monotonic(), record)
         try:
             self.launch(self.specs[role])
-        except TestbedError:
+        except TestbedError as error:
             del self.down[role]
+            self._refusals[role] = str(error)
             return False
         return True
 
@@ -141,6 +143,8 @@ class Recovery:
 
     def reason(self, role: str) -> str:
         """Why a role that is lost ends the run, to be said behind how it was lost; nothing where that is plain."""
+        if role in self._refusals:
+            return f"; it could not be started anew: {self._refusals[role]}"
         times = self._restarts[role]
         return f"; it was started anew {times} time{'s' * (times != 1)} before" if times else ""
 
