@@ -83,7 +83,7 @@ def test_the_scenarios_that_come_with_it_run(testbed: Command, tmp_path: Path, n
     given = sorted((Path(__file__).parents[2] / "scenarios").glob("*.toml"))
     assert given
     for file in given:
-        small = {"input": None, **to_dict(load_scenario(file)), "steps": 6, "lanes": 2}
+        small = {"input": None, **to_dict(load_scenario(file)), "steps": 6, "lanes": 2, "events": []}
         for spec in small["estimators"]:
             spec.pop("until", None)
         write(tmp_path / file.name, **small)

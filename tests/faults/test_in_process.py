@@ -8,7 +8,7 @@ import pytest
 
 from faults.trial import trial
 
-ALL, SOME, A_TEST = 500, 40, 10
+ALL, SOME, A_TEST = 500, 20, 10
 
 
 def check(seeds: range, folder: Path) -> None:

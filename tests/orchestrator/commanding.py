@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from orchestrator.runs import run, scenario
+from testbed.orchestrator.asked import answer
 from testbed.orchestrator.conductor import Conductor
 from testbed.orchestrator.summary import Summary
 
@@ -21,7 +22,7 @@ class Commanding(Conductor):
         super()._collected(*arguments)
         question = self.asked.pop(self.collector.completed, None)
         if question is not None:
-            self.answers.append(json.loads(self._asked(json.dumps(question).encode())))
+            self.answers.append(json.loads(answer(self, json.dumps(question).encode())))
 
 
 def commanded(

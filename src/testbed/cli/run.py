@@ -105,10 +105,10 @@ def finish(summary: Summary, out: Path, console: Console, *, json: bool) -> NoRe
         sys.stdout.write((out / "summary.json").read_text())
     else:
         Console().print(end_table(summary, out))
-    if summary.status == "failed":
-        console.print(f"testbed: run {summary.status}: {summary.reason}", markup=False, highlight=False, soft_wrap=True)
     if summary.status != "complete" and (out / FOLDER).exists():
         console.print(f"to finish it: testbed resume {out}", markup=False, highlight=False, soft_wrap=True)
+    if summary.status == "failed":
+        console.print(f"testbed: run {summary.status}: {summary.reason}", markup=False, highlight=False, soft_wrap=True)
     raise typer.Exit(EXIT_CODES[summary.status])
 
 

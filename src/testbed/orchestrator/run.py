@@ -139,8 +139,8 @@ class Run:
             bus = ZenohBus(session, deadline_s=transport.deadline_ns / 1e9, express=self._setup.express)
             bus.timed = self._setup.real
             self.desk.wake = lambda: bus.call(self.desk.work)
-            cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
             conductor = self._conductor(bus, recorder, policies, journal, external)
+            cleanup.enter_context(published(self._out, self._setup.run, endpoint, transport))
 
             def launch(role: RoleSpec) -> None:
                 if role.name in external:
