@@ -187,6 +187,17 @@ def test_what_was_commanded_happens_at_its_step_again(every: int, tmp_path: Path
     assert len(done) >= 3
 
 
+def test_a_pause_in_the_scenario_and_one_by_command_do_not_hinder_the_end(tmp_path: Path) -> None:
+    """The key of how long is no name that Python has."""
+    pause = {"action": "pause", "role": "plant", "for": "10 ms"}
+    given, left = journalled(events=[{**pause, "at": 3}]), tmp_path / "left"
+    with patch.dict(ORDERS, {60: pause, 100: {**pause, "at": 19}}, clear=True):
+        assert cut_run(given, tmp_path / "cut", 200, left, settled=True, meanwhile=order)
+    again, _ = resume(left)
+    assert [(event.action, event.lasts, event.ok) for event in again.events] == [("pause", "10 ms", True)] * 3
+    assert (again.events[0].step, again.events[-1].step) == (3, 19)
+
+
 def _decided(left: Path) -> list[tuple[Any, Any]]:
     """(step, origin) of what was commanded, as the journal has it."""
     begun = resumed(left)

@@ -13,6 +13,7 @@ from testbed.orchestrator.recovery import Checkpoint
 from testbed.orchestrator.resuming import facts_of
 from testbed.orchestrator.services import Origin
 from testbed.orchestrator.summary import Happened
+from testbed.scenario.write import event_table
 
 _FLUSH_S = 1.0
 
@@ -88,12 +89,12 @@ class Keeper:
         )
 
     def _accepted(self, event: Any, number: int, timed: bool) -> None:
-        table = event.model_dump(mode="json", exclude_none=True, by_alias=True)
-        self._journal.note(ordered=table, number=number, timed=timed)
+        self._journal.note(ordered=event_table(event), number=number, timed=timed)
 
     def _decided(self, event: Any, origin: Origin, step: int) -> None:
         if origin.number >= self._events:
-            table = {**event.model_dump(mode="json", exclude_none=True, exclude={"when"}), "at": step}
+            table = {**event_table(event), "at": step}
+            table.pop("when", None)
             self._journal.note(command=table, number=origin.number, by=origin.by, when=origin.when, true=origin.true_at)
 
     def _refused(self, entry: Happened) -> None:

@@ -21,7 +21,7 @@ from testbed.orchestrator.roles import RoleSpec
 from testbed.orchestrator.services import Origin, Turn
 from testbed.orchestrator.summary import Downtime, Happened, Recovered, read_summary
 from testbed.orchestrator.timeline import happened
-from testbed.scenario import EstimatorSpec, Scenario, parse_scenario
+from testbed.scenario import EstimatorSpec, Scenario, parse_scenario, to_dict
 from testbed.scenario.events import Event
 from testbed.wire.messages import Status
 from testbed.wire.node import ORCHESTRATOR
@@ -149,10 +149,9 @@ def _why_none(folder: Path) -> str:
 def _with_events(given: Scenario, tables: list[dict[str, Any]], path: Path) -> Scenario:
     if not tables:
         return given
-    events = [event.model_dump(mode="json", exclude_none=True) for event in given.events]
-    data = {**given.model_dump(mode="json", exclude_none=True), "events": [*events, *tables]}
+    data = to_dict(given)
     try:
-        return Scenario.model_validate(data)
+        return Scenario.model_validate({**data, "events": [*data.get("events", ()), *tables]})
     except ValidationError as error:
         raise UsageError(f"{path}: what was commanded does not fit the scenario: {error}") from None
 

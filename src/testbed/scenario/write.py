@@ -5,6 +5,7 @@ from typing import Any
 
 import tomli_w
 
+from testbed.scenario.events import Event
 from testbed.scenario.models import Scenario
 
 _NUMBERS = re.compile(r"\[\n((?: *[-+0-9.eE]+,\n)+) *\]")
@@ -13,19 +14,20 @@ _NUMBERS = re.compile(r"\[\n((?: *[-+0-9.eE]+,\n)+) *\]")
 
 def to_dict(scenario: Scenario) -> dict[str, Any]:
     """The resolved scenario as plain tables, lists, texts and numbers; what is left out has no value in TOML."""
-    table = _without_none(scenario.model_dump(mode="json", by_alias=True))
+    table = _without_none(scenario.model_dump(mode="json", by_alias=True, exclude={"events"}))
     estimators = table.pop("estimators")
     if estimators:
         table["estimators"] = [_flat(spec) for spec in estimators]
-    events = table.pop("events")
-    if events:
-        table["events"] = [_with_flat_service(event) for event in events]
+    if scenario.events:
+        table["events"] = [event_table(event) for event in scenario.events]
     result: dict[str, Any] = table
     return result
 
 
-def _with_flat_service(event: dict[str, Any]) -> dict[str, Any]:
-    return {**event, "to": _flat(event["to"])} if isinstance(event.get("to"), dict) else event
+def event_table(event: Event) -> dict[str, Any]:
+    """An event as in the file."""
+    table: dict[str, Any] = _without_none(event.model_dump(mode="json", by_alias=True))
+    return {**table, "to": _flat(table["to"])} if isinstance(table.get("to"), dict) else table
 
 
 def _flat(spec: dict[str, Any]) -> dict[str, Any]:
